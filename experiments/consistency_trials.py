@@ -19,7 +19,7 @@ from slam.data import Observations
 from slam.evaluation.metrics import nees, pose_residuals
 from slam.geometry import se3
 from slam.geometry.se3 import Array
-from slam.models import EstimatorModels, MotionModel, models_for
+from slam.models import EstimatorModels, MotionModel, SlideModel, models_for
 from slam.registry import ONLINE
 from slam.run.recording import Recording
 from slam.worlds import open_world
@@ -59,7 +59,7 @@ def simulated(case: str, seed: int, frames: int) -> tuple[Recording, WorldSequen
     """A recording of a case, in the world's own coordinates, and the world."""
     world = "desk" if case == "drawn" else case
     sequence = open_world(f"{world}?frames={frames}&seed={seed}&outliers=0")
-    models = replace(models_for(sequence.kind), pixel_sigma=sequence.values["sigma"])
+    models = replace(models_for(sequence.kind), pixel_sigma=sequence.values["sigma"], slide=SlideModel())
     rng = np.random.default_rng([seed, 77])
     if case == "drawn":
         models = replace(models, motion=DRAWN, initial_velocity_sigma=0.1, initial_angular_velocity_sigma=0.1)

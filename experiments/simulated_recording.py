@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from slam.data import IdArray, Observations
-from slam.models import EstimatorModels, models_for
+from slam.models import EstimatorModels, SlideModel, models_for
 from slam.run.recording import RecordedFrame, Recording
 from slam.tracks.config import MapConfig
 from slam.tracks.mapper import depth_is_known, new_landmarks
@@ -37,7 +37,8 @@ def true_recording(
         keep: landmarks that were not seen for so many frames leave the map; None: they stay for ever.
     """
     if models is None:
-        models = replace(models_for(sequence.kind), pixel_sigma=max(sequence.values["sigma"], _LEAST_SIGMA))
+        sigma = max(sequence.values["sigma"], _LEAST_SIGMA)
+        models = replace(models_for(sequence.kind), pixel_sigma=sigma, slide=SlideModel())
     frames = _frames(sequence, models, config or MapConfig(), keep)
     return Recording(sequence.name, sequence.rig, models, tuple(frames), sequence.ground_truth)
 

@@ -300,24 +300,3 @@ class RowFile:
     def close(self) -> None:
         """Close the file; everything was written before."""
         self._file.close()
-
-
-def lock_folder(folder: Path) -> int | None:
-    """Keep other runs out of a folder until the returned descriptor is closed, or the process ends; else SlamError.
-
-    The folder itself is locked, so that no lock file is left behind. Returns None if the system has no such locks.
-    """
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return None
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        raise SlamError(f"{folder}: another run is writing to this folder") from None
-    except OSError:  # a file system without locks
-        os.close(descriptor)
-        return None
-    return descriptor

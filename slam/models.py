@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slam.bounds import require_not_negative, require_positive
+from slam.bounds import LEAST, require_not_negative, require_positive
 from slam.checks import is_rigid
 from slam.chi_square import SIGMAS
 from slam.errors import ConfigurationError
@@ -141,12 +141,35 @@ class ObjectModels:
 
 
 @dataclass(frozen=True)
+class SlideModel:
+    """How a landmark's feature slides over its surface, for back ends that model it.
+
+    A feature is found where the image looks like it; from another viewpoint that is another point of the surface. Its
+    pixel walks at random, in both images alike. To back ends without this model the slide is a part of the noise.
+
+    Attributes:
+        density: of that walk with the angle from which the landmark is seen [px / √rad]; 0 for none.
+        share: of `EstimatorModels.pixel_sigma` that is left as noise beside the slide.
+
+    Raises:
+        ConfigurationError: a number is negative or not finite, or the share above 1.
+    """
+
+    density: float = 0.0
+    share: float = 1.0
+
+    def __post_init__(self) -> None:
+        require_not_negative(self, {"density": (0.0, 1e3), "share": (LEAST, 1.0)}, "slide")
+
+
+@dataclass(frozen=True)
 class EstimatorModels:
     """Noise, priors and gate shared by all back ends.
 
     Attributes:
         motion: the motion model.
         pixel_sigma: standard deviation of uL, vL and uR [px].
+        slide: how landmarks' features slide; to back ends without it this is a part of `pixel_sigma`.
         gate_probability: an observation is rejected if its innovation lies outside this quantile of χ².
         initial_position_sigma, initial_rotation_sigma: standard deviations of the first pose [m], [rad]; tiny if it
             defines the world frame.
@@ -158,6 +181,7 @@ class EstimatorModels:
 
     motion: MotionModel = field(default_factory=MotionModel)
     pixel_sigma: float = 1.0
+    slide: SlideModel = field(default_factory=SlideModel)
     gate_probability: float = 0.999
     initial_position_sigma: float = 1e-4
     initial_rotation_sigma: float = 1e-5
@@ -179,6 +203,11 @@ class EstimatorModels:
         if self.gate_probability >= 1:
             raise ConfigurationError(f"gate_probability must lie between 0 and 1, got {self.gate_probability}")
 
+    def with_slide(self) -> EstimatorModels:
+        """For a back end that models the slide: the noise of pixels is what is left beside it."""
+        share = self.slide.share if self.slide.density else 1.0
+        return replace(self, pixel_sigma=share * self.pixel_sigma)
+
     @property
     def initial_pose(self) -> Array:
         """The first pose (4, 4)."""
@@ -191,6 +220,7 @@ KINDS = {
     "driving": EstimatorModels(
         MotionModel(acceleration=1.0, angular_acceleration=0.3, wheels=True),
         pixel_sigma=0.7,
+        slide=SlideModel(3.0, 0.4),
         initial_velocity_sigma=15.0,
         initial_angular_velocity_sigma=0.3,
         objects=ObjectModels(

@@ -1,4 +1,4 @@
-"""Scripts outside of any package, as modules."""
+"""Scripts outside of any package, as modules; the command in this process."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from typer.testing import CliRunner
+
+from slam.commands.cli import app
+from slam.errors import SlamError
 
 ROOT = Path(__file__).parent.parent
 
@@ -21,3 +25,12 @@ def load_script(name: str) -> ModuleType:
         patch.setitem(sys.modules, path.stem, module)  # dataclasses look their module up
         spec.loader.exec_module(module)
     return module
+
+
+def command(*words: object) -> str:
+    """What the command ``slam`` prints, called in this process; an error of its own is raised."""
+    done = CliRunner().invoke(app, [*map(str, words)])
+    if isinstance(done.exception, SlamError):
+        raise done.exception
+    assert done.exit_code == 0, (done.output, done.exception)
+    return done.output

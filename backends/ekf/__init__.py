@@ -2,15 +2,14 @@
 
 In the papers' order:
 
+- `camera`: what the filter asks of a camera, and what an error is.
 - `motion`: the camera's state and its transition (paper B, section 2), in angles kept from their singularity.
 - `landmarks`: a landmark's three numbers, and the table of all.
-- `solve`: measurement, innovation, gate, and the update of the mean (A, Eqs. 5-11; B, Eqs. 1-5); `recovery`: what else
-  is tried where it fails.
+- `innovation`: measurement, ν and S (A, Eqs. 5-10; B, Eqs. 1-5); `solve`: gate, and the update of the mean (A, Eq. 11);
+  `recovery`: what else is tried where it fails.
 - `covariance`: ``A P Aᵀ + W Q Wᵀ`` (B, section 2), landmarks that join (A, Eq. 10), ``P − K S Kᵀ`` (A, Eq. 11).
 - `state`: camera, landmarks and covariance, and the steps from one such state to the next.
 - `filter`: a back end for any camera; `backend`: the papers'.
-
-An error is what is true less what is believed: the estimate is corrected by adding it (`EulerCamera.moved`).
 """
 
 from backends.ekf.backend import EkfBackend, EkfConfig

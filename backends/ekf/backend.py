@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from backends.ekf.filter import LandmarkFilter
@@ -11,7 +11,7 @@ from backends.ekf.motion import EulerCamera
 from slam.bounds import from_options, require_positive
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
-from slam.models import EstimatorModels
+from slam.models import EstimatorModels, SlideModel
 
 MEASUREMENTS = ("stereo", "left")
 
@@ -22,8 +22,9 @@ class EkfConfig:
 
     Attributes:
         papers: closest to the papers' filter: the left pixel alone, one linearisation, landmarks in the world, a
-            covariance that is not transported. The other options do not count then. What stays is the gate by what all
-            others predict, the outlier test, the recovery, and the limit of 300 landmarks in the state.
+            covariance that is not transported, features that do not slide. The other options do not count then. What
+            stays is the gate by what all others predict, the outlier test, the recovery, and the limit of 300 landmarks
+            in the state.
         measurement: ``"stereo"`` measures (uL, vL, uR), ``"left"`` the left pixel alone, as the papers do (paper A, V).
         iterations: most linearisations in an update; 1 is the papers' filter (paper A, Eq. 11). More are made only in
             updates where the first is not linear to within the noise.
@@ -72,10 +73,9 @@ class EkfBackend(LandmarkFilter):
 
     def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
         self.config = from_options(EkfConfig, "ekf", options)
-        use = (
-            EkfConfig(measurement="left", iterations=1, landmarks="euclidean", consistent=False)
-            if self.config.papers
-            else self.config
-        )
+        use = self.config
+        if use.papers:
+            use = EkfConfig(measurement="left", iterations=1, landmarks="euclidean", consistent=False)
+            models = replace(models, slide=SlideModel())
         first = EulerCamera.first(models, use.consistent)
         super().__init__(rig, models, *first, COORDINATES[use.landmarks], use.iterations, use.measurement == "stereo")

@@ -9,7 +9,7 @@ What is known of a landmark from elsewhere is independent of all else until it i
 
 Errors of the rig (`slam.interfaces.ConsideringBackend`) are considered, too, but not estimated. What is kept are the
 derivatives of all errors by them, which the same gain moves: a landmark's measurement is off by ``H x − F δ``, with a
-field F. Their own covariance is not needed here. The last of them may be a change of the correction, known to be 1.
+field F. Their own covariance is not needed here.
 """
 
 from __future__ import annotations
@@ -81,17 +81,14 @@ class Covariance:
         out[there] = self.by_rig[len(self.head) + numbers_of(rows[there])].reshape(-1, *out.shape[1:])
         return out
 
-    def displaced(self, change: Array, shift: Array) -> Covariance:
-        """After a change (B + A, 3) of the landmarks' coordinates that is none of their error: the last of the rig's.
+    def displaced(self, rows: IndexArray, change: Array) -> Covariance:
+        """After a change (M, 3) of some landmarks' coordinates that is none of their error.
 
-        To their errors `shift` (B + A, 3, 6) times that of the pose is added.
+        It is that of the last of the rig's errors, which is known to be 1 (`slam.interfaces.ConsideringBackend`).
         """
-        h, head, shift = len(self.head), self.head.copy(), shift.reshape(-1, POSE)
-        by_rig = np.concatenate([self.by_rig[:h], self.by_rig[h:] + shift @ self.by_rig[:POSE]])
-        by_rig[h:, -1:] -= change.reshape(-1, 1)
-        half = shift @ (head[:POSE, h:] + 0.5 * self.pose @ shift.T)
-        head[:, h:] += head[:, :POSE] @ shift.T
-        return replace(self, head=head, marks=self.marks + half + half.T, by_rig=by_rig)
+        by_rig, there = self.by_rig.copy(), rows < self.correlated
+        by_rig[len(self.head) + numbers_of(rows[there]), -1:] -= change[there].reshape(-1, 1)
+        return replace(self, by_rig=by_rig)
 
     def joint_poses(self, J: Array, n: int) -> Array:
         """Joint covariance (6n, 6n) of the last poses, the present one, J (6, 6) times [r, φ], last."""
@@ -127,6 +124,14 @@ class Covariance:
         return replace(self, head=head, by_rig=by_rig)
 
     # --- landmarks join and leave ---
+
+    def widened(self, rows: IndexArray, noise: Array) -> Covariance:
+        """With more noise (M, 3, 3) of some landmarks, by rows of the table."""
+        marks, known, there = self.marks.copy(), self.known.copy(), rows < self.correlated
+        each = numbers_of(rows[there]).reshape(-1, 3)
+        marks[each[:, :, None], each[:, None, :]] += noise[there]
+        known[rows[~there] - self.correlated] += noise[~there]
+        return replace(self, marks=marks, known=known)
 
     def appended(self, J: Array, noise: Array, by_rig: Array) -> Covariance:
         """With landmarks ``Y = g(r, φ) + noise`` (paper A, Eq. 10), by derivatives (M, 3, 6) and covariances (M, 3, 3).
@@ -195,6 +200,12 @@ class Covariance:
         by_rig[h + b :] += shift @ by_rig[:POSE] - V_marks @ lost_by_rig
         head[:, h + b :] += head[:, :POSE] @ shift.T
         return replace(self, head=head, marks=marks, by_rig=by_rig)
+
+    def transported(self, shift: Array) -> Covariance:
+        """With a shift (A, 3, 6) as `corrected` adds it, and nothing measured."""
+        h, b = len(self.head), 3 * self.parked
+        V = np.zeros((h, 1)), np.zeros((b, 1)), np.zeros((len(self.marks) - b, 1), order="F")
+        return self.corrected(V, np.zeros((1, self.by_rig.shape[1])), np.eye(CAMERA), shift)
 
 
 def numbers_of(rows: IndexArray) -> IndexArray:

@@ -102,13 +102,16 @@ class FilterLandmarks(LandmarkRows):
     points: Array  # positions (N, 3) [m] in the world, which follow from the two
     gauge: Array  # derivatives (N, 3, 6) of the coordinates by one of the world [shift, turn about its origin]
     seen: IndexArray  # number of the frame (N,) that measured each last; that of its first sight at least
+    turned: Array  # largest angle (N,) between the lines of sight at first and since [rad]; π if known from elsewhere
 
     @classmethod
-    def at(cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array, frame: int) -> FilterLandmarks:
+    def at(
+        cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array, frame: int, turned: float = 0.0
+    ) -> FilterLandmarks:  # fmt: skip
         """New ones at positions (M, 3)."""
         c = coordinates.of(anchors, points)
-        seen = np.full(len(ids), frame)
-        return cls(ids, anchors, c, points, gauge_jacobian(coordinates, anchors, c, points), seen)
+        seen, angle = np.full(len(ids), frame), np.full(len(ids), turned)
+        return cls(ids, anchors, c, points, gauge_jacobian(coordinates, anchors, c, points), seen, angle)
 
     @classmethod
     def none(cls) -> FilterLandmarks:

@@ -1,20 +1,11 @@
 """How the camera moves, for [r, φ, v, ω] and its printed transition (paper B, section 2).
 
-A filter may be of another camera (`backends.iekf`), which has the methods of `EulerCamera`: they say what its error
-(12,) means, of which six numbers are of the pose, and six of velocity and rate.
-
 The papers' ``R(φ) = Rz(φz) Ry(φy) Rx(φx)`` (paper B, below Eq. 2) takes camera coordinates to a world whose axes may
 be chosen; it is singular at φy = ±90°. With z forward, y down and the first camera as the world, turning 90° about the
 vertical would be that. So the angles refer to a world of their own, turned against the user's by a constant rotation:
 its x is where the camera looks at the start, its y the camera's right, its z down. Heading is then φz, looking up and
-down φx, and φy a roll about the optical axis: only a camera held on its side comes near the singularity. Before a step
-there the angles' world is chosen again (`reanchored`), exactly for the state, to first order for the covariance. An
-update keeps it: after a roll by some 80° that no prediction foresaw, this camera is far too sure of itself, and
-`backends.iekf` is not.
-
-``world()`` is the displacement of the world by an error of the pose, ``FilterLandmarks.gauge`` that of a landmark's
-coordinates by one of the world; their product is what an error of the pose does to a landmark that it takes along (the
-`lever` of `backends.ekf.solve`). Transport keeps the displacement: ``world(to) · J = world(from)``.
+down φx, and φy a roll about the optical axis: only a camera held on its side comes near the singularity. Where a motion
+or an update leads there, the angles' world is chosen again, exactly for the state, to first order for the covariance.
 
 What the Euler model costs: a constant ω is a constant rate of the angles, which is a constant body rate only for turns
 about one axis. Turning at w [rad/s] while another angle changes at u, the predicted body rate is off by about u w Δt
@@ -28,16 +19,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
+from backends.ekf.camera import AT_REST, Motion, after_gap, motion_noise, prior
 from backends.ekf.covariance import CAMERA, POSE
 from slam.geometry import se3
 from slam.geometry.se3 import Array, angles, body_rate_matrix, hat, rotation
-from slam.models import ANYWHERE, EstimatorModels
+from slam.models import EstimatorModels
 
-_ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an attitude [rad]
+_ACROSS = 0.1  # numerics: sine of an angle between two axes above which it is known what is across both
 _PIECES = 64  # numerics: at most, of one step through the angles' singularity
 _SMALL_TURN = 0.2  # numerics: of a step whose error may be carried as a turn about the world's axes [rad]
 
@@ -47,9 +38,6 @@ CANONICAL = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 
 #: |φy| beyond which a new angles' world is chosen.
 LIMIT = np.pi / 4
-
-#: A camera that has moved; its error is a matrix (12, 12) times what it was, plus noise of a covariance (12, 12).
-Motion = tuple[Any, Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,23 +62,23 @@ class EulerCamera:
         return se3.pose(self.R_world_angles @ rotation(self.x[3:6]), self.x[:3])
 
     def by_error(self) -> Array:
-        """Derivative (6, 6) of the pose's right perturbation [rotation, translation] by the pose's error."""
+        """See `Camera`."""
         J = np.zeros((POSE, POSE))
         J[:3, 3:], J[3:, :3] = body_rate_matrix(self.x[3:6]), self.pose[:3, :3].T
         return J
 
     def world(self) -> Array:
-        """The displacement (6, 6) of the world [shift, turn about its origin] that is an error of the pose."""
+        """See `Camera`."""
         W, A = np.eye(POSE), turning(self.R_world_angles, self.x)
         W[:3, 3:], W[3:, 3:] = hat(self.x[:3]) @ A, A
         return W
 
     def moved(self, error: Array) -> EulerCamera:
-        """After an error (12,) is corrected."""
+        """See `Camera`."""
         return replace(self, x=self.x + error)
 
     def at(self, T: Array) -> EulerCamera:
-        """At another pose (4, 4), with the same velocities."""
+        """See `Camera`."""
         phi, before = angles(self.R_world_angles.T @ T[:3, :3]), self.x[3:6]
         other = np.array([phi[0] + np.pi, np.pi - phi[1], phi[2] + np.pi])  # the same rotation
         changes = np.stack([phi, other]) - before
@@ -99,14 +87,11 @@ class EulerCamera:
         return replace(self, x=np.concatenate([T[:3, 3], nearest, self.x[POSE:]]))
 
     def minus(self, other: EulerCamera) -> Array:
-        """The error (12,) that would bring the other camera here."""
+        """See `Camera`."""
         return self.x - other.x
 
     def transport(self, to: EulerCamera) -> Array:
-        """An error as seen from another camera, by the error (12, 12): the same displacement of the world.
-
-        See `backends.ekf.state.FilterState.corrected`. Without transport it is the same numbers.
-        """
+        """See `Camera`."""
         J = np.eye(CAMERA)
         if self.transports:
             A, A_before = turning(self.R_world_angles, to.x), turning(self.R_world_angles, self.x)
@@ -117,10 +102,9 @@ class EulerCamera:
         return J
 
     def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion:
-        """After `dt` [s], with the error's covariance P (12, 12): ``A P Aᵀ + W Q Wᵀ`` (paper B, section 2).
+        """See `Camera`: ``A P Aᵀ + W Q Wᵀ`` (paper B, section 2), in pieces through the angles' singularity.
 
-        It is made in pieces where it would run into the angles' singularity. Q is of impulses at its beginning: they
-        change the velocities, which A carries to the pose.
+        Q is of impulses at the beginning: they change the velocities, after the first new world, and A carries them on.
         """
         gap = after_gap(models, P, dt)
         if gap is not None:  # it may be turned anyhow: it stays, independent of the map
@@ -133,7 +117,7 @@ class EulerCamera:
             if max(abs(phi_y), abs(phi_y + rate * dt / pieces)) > LIMIT:
                 camera, G = camera.reanchored()
                 J = G @ J
-                W = G @ W if piece else W  # the impulses come when the first world is chosen
+                W = G @ W if piece else W
             camera, A = camera._transition(dt / pieces)
             J, W = A @ J, A @ W
         return camera, J, motion_noise(models, dt, W)
@@ -155,22 +139,35 @@ class EulerCamera:
         return replace(self, x=x), A
 
     def at_rest(self) -> Motion:
-        """After a step of a camera that stands: the pose stays, and the velocity is zero for certain."""
-        return self._stopped(), np.diag(np.repeat([1.0, 0.0], POSE)), np.zeros((CAMERA, CAMERA))
+        """See `Camera`."""
+        return self._stopped(), AT_REST, np.zeros((CAMERA, CAMERA))
 
     def _stopped(self) -> EulerCamera:
         return replace(self, x=np.concatenate([self.x[:POSE], np.zeros(POSE)]))
 
-    def reanchored(self) -> tuple[EulerCamera, Array]:
-        """In a new angles' world, chosen for its attitude; and the Jacobian (12, 12) of its numbers by the old."""
+    def facing(self, T: Array) -> tuple[EulerCamera, Array]:
+        """See `Camera`."""
+        return self.reanchored(T) if abs(math.sin(self.at(T).x[4])) > math.sin(LIMIT) else (self, np.eye(CAMERA))
+
+    def reanchored(self, T: Array | None = None) -> tuple[EulerCamera, Array]:
+        """In a new angles' world, chosen for its attitude; and the Jacobian (12, 12) of its numbers by the old.
+
+        Its y is the camera's right, its z the camera's down; or, with a pose T (4, 4), across the right of both: φy is
+        zero there, too.
+        """
         phi, omega, J, x = self.x[3:6], self.x[9:12], np.eye(CAMERA), self.x.copy()
-        new = angles(CANONICAL)
+        R = self.pose[:3, :3]
+        down = R[:, 1] if T is None else np.cross(R[:, 0], T[:3, 0])
+        size = np.linalg.norm(down)
+        down = down / size if size > _ACROSS else R[:, 1]
+        world = np.stack([np.cross(R[:, 0], down), R[:, 0], down], axis=1)
+        new = angles(world.T @ R)
         inverse = np.linalg.inv(body_rate_matrix(new))  # the angles' world is made so that this is orthonormal
         G = inverse @ body_rate_matrix(phi)
         x[3:6], x[9:12] = new, G @ omega
         J[3:6, 3:6] = J[9:12, 9:12] = G
         J[9:12, 3:6] = inverse @ (body_rate_derivative(phi, omega) - body_rate_derivative(new, x[9:12]) @ G)
-        return replace(self, x=x, R_world_angles=self.pose[:3, :3] @ CANONICAL.T), J
+        return replace(self, x=x, R_world_angles=world), J
 
 
 def body_rate_derivative(phi: Array, omega: Array) -> Array:
@@ -197,37 +194,3 @@ def _of_angles(P: Array, phi: Array) -> Array:
     E = np.eye(CAMERA)
     E[3:6, 3:6] = E[9:12, 9:12] = np.linalg.inv(body_rate_matrix(phi))
     return np.asarray(E @ P @ E.T)
-
-
-def prior(models: EstimatorModels) -> Array:
-    """The first camera's covariance (12, 12) of position, attitude, velocity, and body rate."""
-    sigmas = (
-        models.initial_position_sigma, models.initial_rotation_sigma,
-        models.initial_velocity_sigma, models.initial_angular_velocity_sigma,
-    )  # fmt: skip
-    return np.diag(np.repeat(np.array(sigmas) ** 2, 3))
-
-
-def motion_noise(models: EstimatorModels, dt: float, W: Array | None = None) -> Array:
-    """``W Q Wᵀ`` (12, 12) of the impulses of a step of `dt` [s], with the printed W (12, 6) or another."""
-    W = np.concatenate([dt * np.eye(POSE), np.eye(POSE)]) if W is None else W
-    return np.asarray(W * np.repeat(models.motion.velocity_variance(dt), 3) @ W.T)
-
-
-def after_gap(models: EstimatorModels, P: Array, dt: float) -> Array | None:
-    """Covariance (12, 12) of a camera that may have turned anyhow in the last `dt` [s]; None where it may not.
-
-    P (12, 12) is that before, of position, attitude, velocity, and rate; of the Euler angles and their rates in the
-    papers' camera. What is returned is of a turn about the body's axes and of the body's rate. The position is as
-    uncertain as the prior of the speed makes it meanwhile. Larger numbers would mean nothing, and leave a double too
-    few digits for the map.
-    """
-    attitude, rate = np.arange(3, 6), np.arange(9, 12)
-    variance = P[attitude, attitude] + 2 * dt * P[attitude, rate] + dt * dt * P[rate, rate]
-    if variance.max() + dt * dt * models.motion.velocity_variance(dt)[1] <= _ANY_ATTITUDE**2:
-        return None
-    after = prior(models)
-    after[:3, :3] = P[:3, :3] + (models.initial_velocity_sigma * dt) ** 2 * np.eye(3)
-    after[:3, :3] *= min(1.0, ANYWHERE**2 / after[:3, :3].diagonal().max())
-    after[3:6, 3:6] = np.pi**2 / 3 * np.eye(3)
-    return after

@@ -15,11 +15,11 @@ import itertools
 import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 
-from backends.ekf.solve import Gated, Posterior, UnsolvableError, Update, gate, solve
+from backends.ekf.innovation import UnsolvableError, Update
+from backends.ekf.solve import Gated, Posterior, gate, solve
 from slam.geometry import se3
 from slam.geometry.se3 import Array
 from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, by_chance
@@ -36,53 +36,53 @@ def agreement(update: Update, noises: Iterable[Array], search: Search) -> Poster
     smallest first; `search` is only called where nothing else helps. Raises UnsolvableError where the reason is
     numerical.
     """
+    P = update.covariance
+    if not (np.isfinite(update.camera.pose).all() and math.isfinite(P.camera.trace() + P.marks.trace())):
+        raise UnsolvableError("the predicted state is not finite")
     found, error, majority = None, None, (len(update.z) + 1) // 2
-    try:
-        for gated in _gated(update, noises, max(MIN_OBSERVATIONS, majority)):
-            try:
-                found = _agreed(gated) or found
-            except UnsolvableError as reason:
-                error = reason
-            if found is not None and found.used.sum() >= majority:
-                return found
-    except UnsolvableError as reason:  # of the prior itself
-        error = reason
-    least = max(MIN_CONSENSUS, majority)
-    finite = math.isfinite(update.covariance.camera.trace() + update.covariance.marks.trace())
-    T = search() if finite and len(update.z) >= least else None
-    if T is not None:
-        models, before = update.measure.models, update.camera.pose
-        far, turned = np.linalg.norm(T[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ T[:3, :3])
-        sigmas = far, turned, models.initial_velocity_sigma, models.initial_angular_velocity_sigma
-        there = replace(update, guess=T).wider(np.diag(np.repeat(np.array(sigmas, float) ** 2, 3)))
-        with suppress(UnsolvableError):
-            restarted = solve(gate(there, at_guess=True))
-            if restarted is not None and restarted.used.sum() >= least:
-                return restarted
+    for prior, at_guess, least in _tries(update, noises):
+        try:
+            gated = gate(prior, at_guess)
+            agreed = _agreed(gated) if gated.used.sum() >= least else None
+        except UnsolvableError as reason:  # another prior may do
+            error = reason
+            continue
+        found = agreed or found
+        if agreed is not None and agreed.used.sum() >= majority:
+            return agreed
+    found = _restarted(update, search, max(MIN_CONSENSUS, majority)) or found
     if found is None and error is not None:
         raise error
     return found
 
 
-def _gated(update: Update, noises: Iterable[Array], majority: int) -> Iterable[Gated]:
-    """The first prior, with more noise or seen from the guess, with which most pass the gate; then it as it is.
+def _tries(update: Update, noises: Iterable[Array]) -> Iterable[tuple[Update, bool, int]]:
+    """Priors, whether each is seen from the guess, and how many observations shall pass its gate.
 
-    What still disagrees is taken out later by `solve`.
+    The usual one; with more noise, or from the guess; the usual one again, of which `solve` takes out what disagrees.
     """
-    first = gate(update)
-    if len(update.z) >= majority > first.used.sum():
-        places = (False, True) if update.guess is not None else (False,)
-        priors = itertools.chain([update], map(update.wider, noises))
-        for prior, at_guess in itertools.product(priors, places):
-            with suppress(UnsolvableError):
-                gated = first if prior is update and not at_guess else gate(prior, at_guess)
-                if gated.used.sum() >= majority:
-                    break
-        else:
-            gated = first
-        if gated is not first:
-            yield gated
-    yield first
+    majority = max(MIN_OBSERVATIONS, (len(update.z) + 1) // 2)
+    if len(update.z) >= majority:
+        for prior in itertools.chain([update], map(update.wider, noises)):
+            yield prior, False, majority
+            if update.guess is not None:
+                yield prior, True, majority
+    yield update, False, 0
+
+
+def _restarted(update: Update, search: Search, least: int) -> Posterior | None:
+    """At the pose on which landmarks agree, if at least so many do."""
+    T = search() if len(update.z) >= least else None
+    if T is None:
+        return None
+    models, before = update.measure.models, update.camera.pose
+    far, turned = np.linalg.norm(T[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ T[:3, :3])
+    sigmas = far, turned, models.initial_velocity_sigma, models.initial_angular_velocity_sigma
+    there = update.facing(T).wider(np.diag(np.repeat(np.array(sigmas, float) ** 2, 3)))
+    with suppress(UnsolvableError):
+        found = solve(gate(there, at_guess=True))
+        return found if found is not None and found.used.sum() >= least else None
+    return None
 
 
 def _agreed(gated: Gated) -> Posterior | None:

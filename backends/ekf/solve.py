@@ -1,35 +1,25 @@
 """The measurement update, gated and iterated: what it makes of a prior. The filter's state is not changed here.
 
-In the papers' order: the measurement ``z = h(x)`` and H (paper A, Eqs. 5-10; B, Eqs. 1-5), the innovation ν and its
-covariance ``S = H P Hᵀ + R = L Lᵀ``, the gate, the gain ``K = P Hᵀ S⁻¹``, the corrected state ``x + K ν`` and its
-covariance ``P − K S Kᵀ`` (paper A, Eq. 11). What is kept is ``y = S⁻¹ ν``: the state changes by ``P Hᵀ y``.
-
-A landmark's measurement depends on where it is as seen from the camera alone. An error x of the camera's pose moves it
-there by ``−lever x`` in its own coordinates, so that ``H = own [−lever, 1]`` has columns for the pose and the
-landmark: a displacement of both together is no row's business, wherever H is taken. A component that is not measured,
-or gated, keeps its row with a zero Jacobian and a zero innovation: it adds nothing.
+In the papers' order: the innovation (`backends.ekf.innovation`), the gate, the gain ``K = P Hᵀ S⁻¹``, the corrected
+state ``x + K ν`` and its covariance ``P − K S Kᵀ`` (paper A, Eq. 11). What is kept is ``y = S⁻¹ ν``: the state changes
+by ``P Hᵀ y``.
 """
 
 from __future__ import annotations
 
-import math
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf
 
-from backends.ekf.covariance import CAMERA, POSE, Covariance, numbers_of
-from backends.ekf.landmarks import Coordinates, FilterLandmarks
+from backends.ekf.camera import Camera
+from backends.ekf.covariance import CAMERA, POSE, numbers_of
+from backends.ekf.innovation import Innovation, Linearisation, UnsolvableError, Update, Whitened
 from slam.chi_square import chi_square_limits
-from slam.data import BoolArray, IndexArray
+from slam.data import BoolArray
 from slam.geometry.se3 import Array
 from slam.window.gating import squared_distances
-from slam.window.solver import upper_inverse
-from slam.window.stereo import RectifiedMeasurement
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
 #: further than needed does harm: it moves points to where noisy pixels want them, and claims information that is not
@@ -40,217 +30,36 @@ _POSE_SHARE = 0.25
 _HALVINGS = 6  # numerics: of a step that does not lower the cost
 
 
-class UnsolvableError(ArithmeticError):
-    """The update has no usable solution; the message says why. It never leaves the back end."""
-
-
-@dataclass(frozen=True, eq=False)
-class Update:
-    """One update: the prior, and what was measured."""
-
-    camera: Any  # `backends.ekf.motion.EulerCamera`, or another
-    covariance: Covariance
-    landmarks: FilterLandmarks  # those that were measured (M,); all are in the state
-    rows: IndexArray  # their rows (M,) in the table of all
-    z: Array  # measurements (M, 3) [px], NaN where a component is not measured
-    measure: RectifiedMeasurement  # what they measure, their noise, and the gate
-    coordinates: Coordinates
-    iterations: int  # most linearisations
-    guess: Array | None = None  # a pose (4, 4) worth trying where the prior is far off
-
-    @property
-    def sigma(self) -> float:
-        """Pixel noise [px]."""
-        return self.measure.models.pixel_sigma
-
-    def wider(self, noise: Array) -> Update:
-        """With more noise (12, 12) of the camera."""
-        return replace(self, covariance=self.covariance.camera_moved(np.eye(CAMERA), noise))
-
-    @cached_property
-    def numbers(self) -> IndexArray:
-        """Where the coordinates (3M,) of the measured landmarks stand among those of the state's."""
-        return numbers_of(self.rows - self.covariance.parked)
-
-    def among_measured(self, change: Array) -> Array:
-        """The part (6 + 3M,) of a change of the state (n,) that the measurements depend on."""
-        return np.concatenate([change[:POSE], change[CAMERA + self.numbers]])
-
-    def seen(self, T: Array, change: Array) -> tuple[Array, Array]:
-        """Predicted (M, 3) [px] at a pose T (4, 4) and a change of the state (n,), NaN behind a camera.
-
-        And derivatives (M, 3, 3) by the coordinates. A landmark is at ``h = Rᵀ (Y − r)`` (paper B, Eqs. 3-5).
-        """
-        anchors, moved = self.landmarks.anchors, change[CAMERA + self.numbers].reshape(-1, 3)
-        c = self.coordinates.moved(self.landmarks.c, moved)
-        z, J = self.measure.stereo.project((self.coordinates.points(anchors, c) - T[:3, 3]) @ T[:3, :3])
-        return z, J @ (T[:3, :3].T @ self.coordinates.jacobian(anchors, c))
-
-    def at(self, camera: Any = None, change: Array | None = None, from_prior: float = 0.0) -> Linearisation:
-        """Linearised at another camera's pose, or the prior's own, and a change of the state (n,) but for the pose.
-
-        The coordinates of measured landmarks have changed by no more than they can.
-        """
-        there, J, mean, numbers = self.camera, np.eye(CAMERA), np.zeros(CAMERA), CAMERA + self.numbers
-        size = CAMERA + len(self.covariance.marks) - 3 * self.covariance.parked
-        change, marks = (np.zeros(size), self.landmarks) if change is None else (change.copy(), self.landmarks)
-        if change[numbers].any():
-            marks = marks.moved(self.coordinates, slice(None), change[numbers].reshape(-1, 3))
-            change[numbers] = (marks.c - self.landmarks.c).reshape(-1)
-        if camera is not None:
-            there = self.camera.at(camera.pose)
-            J = self.camera.transport(there)
-            mean = np.linalg.solve(J, self.camera.minus(there))
-            change[:CAMERA] = np.concatenate([np.zeros(POSE), camera.minus(there)[POSE:]])
-        lever = marks.gauge @ (there.world() @ J[:POSE, :POSE])
-        return Linearisation(self, there, J, mean, change, *self.seen(there.pose, change), lever, from_prior)
-
-
-@dataclass(frozen=True, eq=False)
-class Linearisation:
-    """An update's measurements, linearised somewhere."""
-
-    update: Update
-    camera: Any  # the prior's at another pose
-    J: Array  # (12, 12): an error of the prior's camera is J times that, as an error of this one
-    mean: Array  # the error (12,) of this camera less that of the prior's, in the prior's coordinates
-    change: Array  # of the state (n,) from the prior; 0 for the pose, which counts from here
-    z: Array  # what is predicted here (M, 3) [px]
-    own: Array  # its derivatives (M, 3, 3) by the coordinates
-    lever: Array  # (M, 3, 6), see the module
-    from_prior: float  # squared distance from the prior
-
-    def at_prior(self) -> Linearisation:
-        """With the lever as it is at the prior: no sequence of updates with such measures the gauge."""
-        return replace(self, lever=self.update.landmarks.gauge @ (self.camera.world() @ self.J[:POSE, :POSE]))
-
-    def cost(self, rows: BoolArray) -> float:
-        """Squared distance from prior and measurements; ∞ where one cannot be seen."""
-        residual = np.where(rows, self.update.z - self.z, 0.0)
-        cost = self.from_prior + float(np.vdot(residual, residual)) / self.update.sigma**2
-        return cost if math.isfinite(cost) else math.inf
-
-    def camera_after(self, change: Array) -> Any:
-        """The camera after a change of the state (n,), from here."""
-        return self.camera.moved(self.J @ change[:CAMERA])
-
-    def innovation(self, rows: BoolArray) -> Innovation:
-        """ν and S of some rows (M, 3)."""
-        update, P = self.update, self.update.covariance
-        numbers, b, h = 3 * P.parked + update.numbers, 3 * P.parked, len(P.head)
-        own = self.own if rows.all() else np.where(rows[:, :, None], self.own, 0.0)
-        by_pose, moved = -(own @ self.lever).reshape(-1, POSE), self.change[CAMERA + update.numbers]
-        nu = np.where(rows, update.z - self.z, 0.0).reshape(-1)
-        nu += (own @ moved.reshape(-1, 3, 1)).reshape(-1) - by_pose @ self.mean[:POSE]
-        with_camera = _times(own, by_pose, P.camera[:POSE], P.head[:CAMERA, h + numbers].T)
-        with_marks = _times(own, by_pose, P.head[:POSE, h + b :], P.marks[:, b:][numbers])
-        S = _times(own, by_pose, with_camera[:, :POSE].T, with_marks[:, update.numbers].T)
-        S[np.diag_indices(len(S))] += update.sigma**2
-        return Innovation(self, rows, own, by_pose, (with_camera, with_marks), nu, S)
-
-
-@dataclass(frozen=True, eq=False)
-class Innovation:
-    """ν and its covariance S (paper A, Eq. 11)."""
-
-    at: Linearisation
-    rows: BoolArray  # mask of its rows (M, 3)
-    own: Array  # H: derivatives (M, 3, 3) of each landmark's measurement by its own coordinates
-    by_pose: Array  # and (3M, 6) by the pose's error
-    HP: tuple[Array, Array]  # H P: with the camera (3M, 12), and with the landmarks of the state (3M, 3A)
-    nu: Array  # innovation of the prior's mean (3M,)
-    S: Array  # its covariance (3M, 3M)
-
-    def whitened(self, used: BoolArray) -> Whitened:
-        """That of some landmarks (mask (M,)), whitened; UnsolvableError where S is not positive definite."""
-        nu, S, out = self.nu, self.S, np.flatnonzero(np.repeat(~used, 3))
-        if len(out):
-            nu, S = nu.copy(), S.copy()
-            nu[out], S[out], S[:, out], S[out, out] = 0.0, 0.0, 0.0, 1.0
-        upper, info = dpotrf(S.T)  # of the transpose, which is in the order that LAPACK wants
-        if info != 0:
-            raise UnsolvableError("the innovation covariance is not positive definite")
-        inverse = upper_inverse(upper).T
-        inverse[out, out] = 0.0
-        return Whitened(self, used, nu, inverse)
-
-
-def _times(own: Array, by_pose: Array, of_pose: Array, of_marks: Array) -> Array:
-    """H (3M, ·) of a matrix with the rows (6, k) of the pose and (3M, k) of the measured landmarks."""
-    out = by_pose @ of_pose
-    out += (own @ of_marks.reshape(len(own), 3, -1)).reshape(out.shape)
-    return np.asarray(out)
-
-
-@dataclass(frozen=True, eq=False)
-class Whitened:
-    """The innovation of some landmarks whitened by ``S = L Lᵀ``: ``w = L⁻¹ ν`` has covariance 1."""
-
-    innovation: Innovation
-    used: BoolArray  # which landmarks (M,)
-    nu: Array  # (3M,), zero for the others
-    inverse: Array  # L⁻¹ (3M, 3M), lower triangular, with zero rows for the others
-
-    @cached_property
-    def consistent(self) -> Whitened:
-        """That from which the covariance follows: where it is transported, pose and landmarks move as at the prior."""
-        nu = self.innovation
-        if not nu.at.update.camera.transports or not nu.at.change.any():
-            return self
-        return nu.at.at_prior().innovation(nu.rows).whitened(self.used)
-
-    @cached_property
-    def w(self) -> Array:
-        """The whitened innovation (3M,); its square is the NIS ``νᵀ S⁻¹ ν``."""
-        return np.asarray(self.inverse @ self.nu)
-
-    @cached_property
-    def y(self) -> Array:
-        """``S⁻¹ ν`` (3M,)."""
-        return np.asarray(self.w @ self.inverse)
-
-    @cached_property
-    def by_pose(self) -> Array:
-        """The whitened innovation's covariance (3M, 6) with the pose."""
-        return np.asarray(self.inverse @ self.innovation.HP[0][:, :POSE])
-
-    def gain_root(self) -> tuple[tuple[Array, Array, Array], Array]:
-        """``P Hᵀ L⁻ᵀ``, and L⁻¹ times derivatives of ν by errors of the rig; see `Covariance.corrected`."""
-        nu, (with_camera, with_marks), update = self.innovation, self.innovation.HP, self.innovation.at.update
-        P, H = update.covariance, (nu.own, nu.by_pose)
-        h, b, numbers = len(P.head), 3 * P.parked, 3 * P.parked + update.numbers
-        poses_and_left = np.concatenate([P.head[CAMERA:, h + numbers].T, P.marks[:, :b][numbers]], axis=1)
-        rest = _times(*H, P.head[:POSE, CAMERA : h + b], poses_and_left)
-        V = dtrmm(1.0, self.inverse.T, np.concatenate([with_camera, rest], axis=1).T, side=1)
-        by_rig = _times(*H, P.by_rig[:POSE], P.by_rig[h + numbers])
-        by_rig -= np.where(nu.rows[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
-        return (V[:h], V[h:], dtrmm(1.0, self.inverse.T, with_marks.T, side=1)), self.inverse @ by_rig
-
-    def distances(self) -> Array:
-        """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any.
-
-        For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off
-        by ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so that the distance is ``y_jᵀ Q_j⁻¹ y_j``.
-        """
-        columns = np.ascontiguousarray(self.inverse.reshape(-1, len(self.used), 3).transpose(1, 2, 0)[self.used])
-        found = np.zeros(len(self.used))
-        found[self.used] = squared_distances(self.y.reshape(-1, 3)[self.used], columns @ columns.transpose(0, 2, 1))
-        if not np.isfinite(found).all():
-            raise UnsolvableError("the innovation covariance is not positive definite")
-        return found
-
-
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """The maximum of the posterior (or one step towards it)."""
 
-    whitened: Whitened  # the last innovation; the covariance follows from that which is `consistent`
-    change: Array  # of the state (n,) from the prior; the pose's part counts from the last linearisation
+    whitened: Whitened  # the last innovation of the mean
+    change: Array  # of the state (n,) from the prior, in the prior's coordinates
 
     @property
     def used(self) -> BoolArray:
         """Which landmarks (M,) it is made of."""
         return self.whitened.used
+
+    @property
+    def camera(self) -> Camera:
+        """After the update."""
+        return self.whitened.innovation.at.camera_after(self.change)
+
+    @cached_property
+    def information(self) -> Whitened:
+        """The innovation that the covariance follows from.
+
+        If the camera transports its error, its pose moves landmarks as it does at the prior. So H is zero along every
+        displacement of the world as the prior's covariance has it, while the mean goes on from where they are by now.
+        """
+        innovation = self.whitened.innovation
+        at, update = innovation.at, innovation.at.update
+        if not (update.camera.transports and at.change.any()):
+            return self.whitened
+        lever = update.landmarks.gauge @ update.camera.world()
+        return replace(at, lever=lever).innovation(innovation.components).whitened(self.used)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,43 +75,83 @@ class Gated:
 def gate(update: Update, at_guess: bool = False) -> Gated:
     """Test each landmark by itself, with its innovation linearised at the prior or at the guess.
 
-    Raises UnsolvableError where the prior is not finite, or S is not positive definite.
+    Raises UnsolvableError where S is not positive definite.
     """
-    start = _at_guess(update) if at_guess else update.at()
-    P, measured = update.covariance, np.isfinite(update.z)
-    if not (np.isfinite(start.camera.pose).all() and math.isfinite(P.camera.trace() + P.marks.trace())):
-        raise UnsolvableError("the predicted state is not finite")
-    visible = np.asarray(np.isfinite(start.z).all(axis=1))
-    innovation = start.innovation(measured & visible[:, None])
-    m, limits = len(visible), chi_square_limits(measured.sum(axis=1), update.measure.models.gate_probability)
-    blocks = innovation.S.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m)]
-    own = squared_distances(innovation.nu.reshape(m, 3), blocks)
+    start = update.at_guess() if at_guess else update.at()
+    measured, innovation = np.isfinite(update.z), start.innovation(start.seen())
+    limits = chi_square_limits(measured.sum(axis=1), update.measure.models.gate_probability)
+    own = squared_distances(innovation.nu.reshape(-1, 3), _blocks(innovation.S))
     if not np.isfinite(own).all():
         raise UnsolvableError("the predicted innovations are not finite or not positive definite")
-    distances = np.where(visible, own, np.nan)
+    distances = np.where(np.isfinite(start.z).all(axis=1), own, np.nan)
     return Gated(np.asarray(distances <= limits), limits, distances, innovation)
 
 
 def solve(gated: Gated) -> Posterior | None:
-    """Solve with what passed the gate, and take out what the other measurements contradict, the worst first.
+    """Solve with what passed the gate and agrees; then once more with what the solution predicts after all.
+
+    None where nothing is left. Raises UnsolvableError where S or the pose's covariance is not positive definite, or the
+    new state not finite.
+    """
+    found, update = _twice(gated), gated.innovation.at.update
+    if found is not None:
+        faced = update.facing(found.camera.pose)
+        if faced.camera is not update.camera:  # the coordinates of its error are nearly singular there
+            found, update = _twice(gate(faced, at_guess=True)), faced
+    if found is not None:
+        root = found.information.by_pose
+        if dpotrf(update.covariance.pose - root.T @ root, lower=1)[1] != 0:
+            raise UnsolvableError("the pose's covariance would not stay positive definite")
+    return found
+
+
+def _twice(gated: Gated) -> Posterior | None:
+    """With what passed the gate, and again where the solution predicts more."""
+    found = _agreeing(gated, gated.used)
+    if found is not None:
+        more = _predicted(found, gated)
+        found = (_agreeing(gated, found.used | more) or found) if more.any() else found
+    return found
+
+
+def _agreeing(gated: Gated, used: BoolArray) -> Posterior | None:
+    """Solve with some landmarks (mask (M,)), and take out what the other measurements contradict, the worst first.
 
     A wrong match spoils the tests of its neighbours, so a round takes out only landmarks at least half as far off as
-    the worst one, until all that is left agrees; None where nothing is left. Raises UnsolvableError where S or the
-    pose's covariance is not positive definite, or the new state not finite.
+    the worst one, until all that is left agrees; None where nothing is left.
     """
-    used = gated.used
     while used.any():
         found = _iterate(gated.innovation.whitened(used))
         excess = found.whitened.distances() / gated.limits
         worst = excess.max()
         if worst <= 1:
-            taken = found.whitened.consistent.by_pose
-            left = gated.innovation.at.update.covariance.pose - taken.T @ taken
-            if dpotrf(left, lower=1)[1] != 0:
-                raise UnsolvableError("the pose's covariance would not stay positive definite")
             return found
         used = used & (excess <= max(1.0, 0.5 * worst))
     return None
+
+
+def _predicted(found: Posterior, gated: Gated) -> BoolArray:
+    """Which landmarks (mask (M,)) that a solution does not use lie within the gate of what it predicts of them.
+
+    The gate tested them at the prior. With X = L⁻¹ S of the used with such a landmark, its innovation given the used
+    ones is ``ν − Xᵀ w``, and its covariance ``S − Xᵀ X``.
+    """
+    at, agree = found.whitened.innovation.at, np.zeros(len(found.used), bool)
+    seen = at.seen()
+    out = np.flatnonzero(~found.used & seen.any(axis=1) & np.isfinite(gated.distances))
+    if len(out):
+        every, numbers = at.innovation(seen), numbers_of(out)
+        X = found.whitened.inverse @ every.S[:, numbers]
+        nu = (every.nu[numbers] - found.whitened.w @ X).reshape(-1, 3)
+        S = every.S[numbers[:, None], numbers] - X.T @ X
+        agree[out] = squared_distances(nu, _blocks(S)) <= gated.limits[out]
+    return agree
+
+
+def _blocks(S: Array) -> Array:
+    """Blocks (M, 3, 3) on the diagonal of S (3M, 3M)."""
+    each = np.arange(len(S) // 3)
+    return np.asarray(S.reshape(len(each), 3, len(each), 3)[each, :, each])
 
 
 def _iterate(whitened: Whitened) -> Posterior:
@@ -311,25 +160,26 @@ def _iterate(whitened: Whitened) -> Posterior:
     Gauss-Newton on the posterior (an iterated Kalman filter); a step that raises the cost is shortened. Where the first
     is far from linear, the guess may be the better next place. One iteration is taken as it is: the papers' filter.
     """
-    rows, reached = whitened.innovation.rows & whitened.used[:, None], None
+    components, reached = whitened.innovation.components & whitened.used[:, None], None
     now, update = whitened.innovation.at, whitened.innovation.at.update
     for iteration in range(1, update.iterations + 1):
-        HP, y = whitened.innovation.HP, whitened.y
-        change = np.concatenate([now.mean + y @ HP[0], y @ HP[1]])
+        innovation, y = whitened.innovation, whitened.y
+        change = np.concatenate([y @ innovation.HP[0], y @ innovation.HP[1]])
         if not np.isfinite(change).all():
             raise UnsolvableError("the corrected state is not finite")
         if update.iterations == 1 or _linear(whitened, change):
             return Posterior(whitened, change)
-        innovation = whitened.innovation
         towards = np.concatenate([y @ innovation.by_pose, (y.reshape(-1, 1, 3) @ innovation.own).reshape(-1)])  # Hᵀ y
-        following, step = _descend(now, rows, towards, change)
+        following, step = _descend(now, components, towards, change)
+        reached = reached if following is now else Posterior(whitened, step)
         if iteration == 1 and update.guess is not None:
-            following = min(following, _at_guess(update), key=lambda iterate: iterate.cost(rows))
+            guess = update.at_guess()
+            if guess.cost(components) < following.cost(components):
+                following, reached = guess, None
         if following is now:
             break
-        reached = Posterior(whitened, step)
         if iteration < update.iterations:
-            now, whitened = following, following.innovation(rows).whitened(whitened.used)
+            now, whitened = following, following.innovation(components).whitened(whitened.used)
     if reached is None:
         raise UnsolvableError("no step towards the solution lowers the cost")
     return reached
@@ -338,11 +188,11 @@ def _iterate(whitened: Whitened) -> Posterior:
 def _linear(whitened: Whitened, change: Array) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
     now, update = whitened.innovation.at, whitened.innovation.at.update
-    z, _ = update.seen(now.camera_after(change).pose, change)
+    following = update.at(now.camera_after(change), change[CAMERA:])
     step = update.among_measured(change - now.change)
     seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
-    rows = whitened.innovation.rows & whitened.used[:, None]
-    errors = np.where(rows, z - now.z - (now.own @ seen[:, :, None])[:, :, 0], 0.0)
+    components = whitened.innovation.components & whitened.used[:, None]
+    errors = np.where(components, following.z - now.z - (now.own @ seen[:, :, None])[:, :, 0], 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
     shift = (whitened.inverse @ errors.reshape(-1)) @ whitened.by_pose
@@ -350,29 +200,20 @@ def _linear(whitened: Whitened, change: Array) -> bool:
     return bool((shift**2 <= _POSE_SHARE**2 * variances).all())
 
 
-def _at_guess(update: Update) -> Linearisation:
-    """The guess, with the landmarks where they are believed: its distance from the prior is that of the pose alone."""
-    there, distance = update.at(update.camera.at(update.guess)), math.inf
-    with suppress(np.linalg.LinAlgError):  # a pose that is known exactly cannot be moved
-        mean = there.mean[:POSE]
-        distance = float(mean @ np.linalg.solve(update.covariance.pose, mean))
-    return replace(there, from_prior=distance)
+def _descend(now: Linearisation, components: BoolArray, s: Array, change: Array) -> tuple[Linearisation, Array]:
+    """The longest of the steps 1, 1/2, 1/4, ... towards ``change = P s`` that does not raise the cost, else now.
 
-
-def _descend(now: Linearisation, rows: BoolArray, s: Array, change: Array) -> tuple[Linearisation, Array]:
-    """The longest of the steps 1, 1/2, 1/4, ... towards ``change = mean + P s`` that does not raise the cost, else now.
-
-    Where it ends, and the step (n,). The next linearisation is at the pose reached: the camera turns, and the landmarks
-    stay. On the way the distance from the prior, with d at the start and d' at the end, is that of (1 − a) d + a d'.
+    Where it ends, and the step (n,). On the way the distance from the prior, with d here and d' at the end, is that of
+    (1 − a) d + a d'.
     """
-    update, mean = now.update, np.concatenate([now.mean, np.zeros(len(change) - CAMERA)])
-    end, between = (float(s @ update.among_measured(x - mean)) for x in (change, now.change))
-    cost = now.cost(rows)
+    update = now.update
+    end, between = (float(s @ update.among_measured(x)) for x in (change, now.change))
+    cost = now.cost(components)
     for halving in range(_HALVINGS):
         a = 0.5**halving
         step = now.change + a * (change - now.change)
         distance = (1 - a) ** 2 * now.from_prior + 2 * a * (1 - a) * between + a * a * end
-        following = update.at(now.camera_after(step), step, distance)
-        if following.cost(rows) <= cost * (1 + 1e-9):
+        following = update.at(now.camera_after(step), step[CAMERA:], distance)
+        if following.cost(components) <= cost * (1 + 1e-9):
             return following, step
     return now, change

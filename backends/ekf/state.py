@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
+from backends.ekf.camera import Camera, Motion
 from backends.ekf.covariance import CAMERA, Covariance
+from backends.ekf.innovation import UnsolvableError
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
-from backends.ekf.motion import Motion
-from backends.ekf.solve import Posterior, UnsolvableError
+from backends.ekf.solve import Posterior
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
 
@@ -30,12 +30,12 @@ class FilterState:
     frame: int  # number of the prediction, −1 before the first
     dt: float  # time since the last one [s], 0 for the first
     closed: bool  # whether the pose may not be updated any more
-    camera: Any  # `backends.ekf.motion.EulerCamera`, or another: pose and velocities, and what their error means
+    camera: Camera
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of everything
 
     @classmethod
-    def first(cls, camera: Any, P: Array) -> FilterState:
+    def first(cls, camera: Camera, P: Array) -> FilterState:
         """Before the first prediction, with the covariance (12, 12) of the camera's error."""
         return cls(float("nan"), -1, 0.0, True, camera, FilterLandmarks.none(), Covariance.of_camera(P))
 
@@ -58,6 +58,27 @@ class FilterState:
         covariance = self.covariance.with_pose(self.camera.by_error(), RECENT).camera_moved(J, noise)
         dt, frame = stamp - self.stamp, self.frame + 1
         return replace(self, stamp=stamp, frame=frame, dt=dt, closed=False, camera=camera, covariance=covariance)
+
+    def slid(self, coordinates: Coordinates, rows: IndexArray, density: float) -> FilterState:
+        """With the slide of some landmarks' features (rows (M,)), seen now from farther round than ever before.
+
+        A feature is found where the image looks like it; from another viewpoint that is another point of the surface. A
+        landmark's direction walks at random with the angle between its lines of sight, by `density` [rad / √rad].
+        """
+        marks, at = self.landmarks.select(rows), self.pose[:3, 3]
+        first, now = marks.points - marks.anchors[:, :, 3], marks.points - at
+        distance = np.linalg.norm(now, axis=1)
+        cosine = np.einsum("ni,ni->n", first, now) / (np.linalg.norm(first, axis=1) * distance)
+        turned = np.maximum(marks.turned, np.arccos(np.clip(cosine, -1.0, 1.0)))
+        more = turned - marks.turned
+        if not density or not (more > 0).any():
+            return self
+        n = now / distance[:, None]
+        across = (density**2 * more * distance**2)[:, None, None] * (np.eye(3) - n[:, :, None] * n[:, None, :])
+        D, angles = coordinates.inverse_jacobian(marks.anchors, marks.c), self.landmarks.turned.copy()
+        angles[rows] = turned
+        covariance = self.covariance.widened(rows, D @ across @ D.transpose(0, 2, 1))
+        return replace(self, landmarks=replace(self.landmarks, turned=angles), covariance=covariance)
 
     # --- landmarks join and leave ---
 
@@ -136,15 +157,37 @@ class FilterState:
         the corrected state: the error is taken to be the displacement that the camera's pose has, by its Jacobian in
         old coordinates and in new, and what it leaves, which stays as it is: the error of an invariant filter (Barrau
         and Bonnabel, 2015). Landmarks that are parked do not move, so that their coordinates need none. Raises
-        UnsolvableError where the new state is not finite.
+        UnsolvableError where the new state is not finite, or a variance is lost in rounding.
         """
-        at, before, P = found.whitened.innovation.at, self.landmarks, self.covariance
-        update, camera, state = at.update, at.camera_after(found.change), slice(P.parked, P.correlated)
-        marks = before.moved(update.coordinates, state, found.change[CAMERA:].reshape(-1, 3))
+        update, camera = found.whitened.innovation.at.update, found.camera
+        marks = self.landmarks.moved(update.coordinates, self._parts()[1], found.change[CAMERA:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise UnsolvableError("the corrected state is not finite")
         marks.seen[update.rows[found.used]] = self.frame
-        shift = (marks.gauge - before.gauge)[state] @ camera.world() * camera.transports
-        lost = found.whitened.consistent.gain_root()
-        covariance = update.covariance.corrected(*lost, self.camera.transport(camera), shift)
+        J, shift = update.camera.transport(camera), self._shift(marks, camera)
+        covariance = update.covariance.corrected(*found.information.gain_root(), J, shift)
+        if not (covariance.marks.diagonal() > 0).all():
+            raise UnsolvableError("a landmark's variance would not stay positive")
         return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()
+
+    def displaced(self, coordinates: Coordinates, ids: IdArray, points: Array) -> FilterState:
+        """With some landmarks at points (M, 3) [m]: their error stays, and the covariance is transported as above.
+
+        What moves them is an error of the rig, the last that is considered, and none of the state's.
+        """
+        s = self.with_all_of(ids)
+        rows = s.landmarks.rows_of(ids)
+        marks = s.landmarks.moved(
+            coordinates, rows, coordinates.of(s.landmarks.anchors[rows], points) - s.landmarks.c[rows]
+        )
+        if not np.isfinite(marks.points).all():
+            return self
+        covariance = s.covariance.displaced(rows, marks.c[rows] - s.landmarks.c[rows]).transported(
+            s._shift(marks, s.camera)
+        )
+        return replace(s, landmarks=marks, covariance=covariance).relieved()
+
+    def _shift(self, marks: FilterLandmarks, camera: Camera) -> Array:
+        """What is added to the errors (A, 3, 6) of landmarks that have moved, by the error of the pose."""
+        change = (marks.gauge - self.landmarks.gauge)[self._parts()[1]]
+        return np.asarray(change @ camera.world() if camera.transports else np.zeros_like(change))

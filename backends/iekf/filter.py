@@ -24,10 +24,10 @@ from typing import Any
 
 import numpy as np
 
+from backends.ekf.camera import AT_REST, Motion, after_gap, motion_noise, prior
 from backends.ekf.covariance import CAMERA, POSE
 from backends.ekf.filter import LandmarkFilter
 from backends.ekf.landmarks import InverseDepth
-from backends.ekf.motion import Motion, after_gap, motion_noise, prior
 from slam.bounds import from_options, require_positive
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
@@ -37,7 +37,7 @@ from slam.models import EstimatorModels
 
 @dataclass(frozen=True, eq=False)
 class InvariantCamera:
-    """Pose and velocities, with the error [δp, θ, δv, δω] (12,); see the module and `backends.ekf.motion`."""
+    """Pose and velocities, with the error [δp, θ, δv, δω] (12,); see the module and `backends.ekf.camera.Camera`."""
 
     pose: Array  # T_world_left (4, 4)
     v: Array  # velocity (3,) in the world [m/s]
@@ -50,40 +50,40 @@ class InvariantCamera:
         return cls(models.initial_pose, np.zeros(3), np.zeros(3)), prior(models)
 
     def by_error(self) -> Array:
-        """See `EulerCamera`: ``[R̂ᵀ θ, R̂ᵀ δp]``."""
+        """See `Camera`: ``[R̂ᵀ θ, R̂ᵀ δp]``."""
         J = np.zeros((POSE, POSE))
         J[:3, 3:] = J[3:, :3] = self.pose[:3, :3].T
         return J
 
     def world(self) -> Array:
-        """See `EulerCamera`: ``ξ_p = δp + p̂ × θ``."""
+        """See `Camera`: ``ξ_p = δp + p̂ × θ``."""
         W = np.eye(POSE)
         W[:3, 3:] = hat(self.pose[:3, 3])
         return W
 
     def moved(self, error: Array) -> InvariantCamera:
-        """See `EulerCamera`."""
+        """See `Camera`."""
         T = se3.pose(se3.so3_exp(error[3:6]) @ self.pose[:3, :3], self.pose[:3, 3] + error[:3])
         return replace(self, pose=T, v=self.v + error[6:9], rate=self.rate + error[9:])
 
     def at(self, T: Array) -> InvariantCamera:
-        """See `EulerCamera`."""
+        """See `Camera`."""
         return replace(self, pose=T)
 
     def minus(self, other: InvariantCamera) -> Array:
-        """See `EulerCamera`."""
+        """See `Camera`."""
         turn = se3.so3_log(self.pose[:3, :3] @ other.pose[:3, :3].T)
         shift = self.pose[:3, 3] - other.pose[:3, 3]
         return np.concatenate([shift, turn, self.v - other.v, self.rate - other.rate])
 
     def transport(self, to: InvariantCamera) -> Array:
-        """See `EulerCamera`: ``T(χ̂⁺)⁻¹ T(χ̂)``."""
+        """See `Camera`: ``T(χ̂⁺)⁻¹ T(χ̂)``."""
         J = np.eye(CAMERA)
         J[:3, 3:6], J[6:9, 3:6] = hat(self.pose[:3, 3] - to.pose[:3, 3]), hat(self.v - to.v)
         return J
 
     def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion:
-        """See `EulerCamera`: ``R ← R Exp(ω Δt)``, ``p ← p + v Δt``, disturbed by the papers' impulses."""
+        """See `Camera`: ``R ← R Exp(ω Δt)``, ``p ← p + v Δt``, disturbed by the papers' impulses."""
         gap = after_gap(models, P, dt)
         if gap is not None:  # it may be turned anyhow: it stays, independent of the map
             return self._stopped(), np.zeros((CAMERA, CAMERA)), gap
@@ -95,8 +95,12 @@ class InvariantCamera:
         return replace(self, pose=T), A, motion_noise(models, dt, A[:, POSE:])
 
     def at_rest(self) -> Motion:
-        """See `EulerCamera`."""
-        return self._stopped(), np.diag(np.repeat([1.0, 0.0], POSE)), np.zeros((CAMERA, CAMERA))
+        """See `Camera`."""
+        return self._stopped(), AT_REST, np.zeros((CAMERA, CAMERA))
+
+    def facing(self, T: Array) -> tuple[InvariantCamera, Array]:
+        """See `Camera`: its error is regular everywhere."""
+        return self, np.eye(CAMERA)
 
     def _stopped(self) -> InvariantCamera:
         return replace(self, v=np.zeros(3), rate=np.zeros(3))

@@ -21,6 +21,8 @@ from slam.tracks.table import Tracks
 
 _UNMEASURED = 1.0  # [s] for which a body is still reported after its last measurement
 UNMEASURED_SHARE = 0.05  #: most frames in which it is so, as a share of those in which it was measured
+PROOF = 4  #: by frames that are certain by both tests, each of which counts twice, or by way and turn together
+SOLID = 0.6  #: share of the points inside a body that go with it: where others stand still, a shadow or leaves move
 CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
 
@@ -48,7 +50,8 @@ class Body:
     evidence: float = 0.0  # evidence that it has moved, given all that is uncertain; see `slam.bodies.proof`
     far: bool = False  # whether it was followed for farther than it is wide before it became a body
     certain: int = 0  # what frames so far count for the proof that it moves, see `slam.bodies.proof`
-    proven: bool = False  # whether it has moved for certain by its tracks
+    agreeing: int = 0  # number of members, added over frames, that went with it rather than stood still
+    against: int = 0  # number of others inside its extent, added over frames, that rather stood still
     moved: bool = False  # whether it has by its estimate, too, see `slam.bodies.estimator`: only then it is reported
     alike: int = 0  # number of frames in which it moved as an older body did, as a part of that would
     age: int = 0  # number of frames since it was found
@@ -57,6 +60,11 @@ class Body:
     apart_from: int | None = None  # id of the body of which it is a part with a motion of its own; None for none
     distinct: frozenset[int] = frozenset()  # ids of bodies that it is known not to be a part of
     belief: BodyBelief | None = field(default=None, repr=False)  # its estimate; None where there is none yet
+
+    @property
+    def proven(self) -> bool:
+        """Whether it has moved for certain by its tracks, and what it encloses has, for the most part."""
+        return self.certain >= PROOF and self.agreeing >= SOLID * (self.agreeing + self.against)
 
     @property
     def across(self) -> float:
@@ -141,8 +149,9 @@ def continued(body: Body, known: Body) -> Body:
     return replace(
         body, id=known.id, T=frame, T_before=body.T_before @ change, history=body.history @ change,
         covariance=turn @ body.covariance @ turn.T, lower=corners.min(axis=0), upper=corners.max(axis=0),
-        proven=known.proven, moved=known.moved, existence=known.existence, evidence=known.evidence, age=known.age,
+        certain=known.certain, moved=known.moved, existence=known.existence, evidence=known.evidence, age=known.age,
         seen=body.seen + known.seen,
+        agreeing=body.agreeing + known.agreeing, against=body.against + known.against,
         measured_at=known.measured_at, distinct=body.distinct | known.distinct, belief=None,
     )  # fmt: skip
 
@@ -160,8 +169,9 @@ def hidden(bodies: Iterable[Body], eye: Array, points: Array) -> BoolArray:
     return behind
 
 
-def with_evidence(body: Body, gain: float) -> Body:
-    """The body after what this frame says of its existence; see `slam.bodies.belief`."""
+def with_evidence(body: Body, gain: float, agreeing: int, against: int) -> Body:
+    """The body after what this frame says of its existence, see `slam.bodies.belief`, and of what it encloses."""
+    body = replace(body, agreeing=body.agreeing + agreeing, against=body.against + against)
     if body.measured:
         return replace(body, existence=when_measured(body.existence, gain))
     return replace(body, existence=when_missed(body.existence, body.seen, body.age))

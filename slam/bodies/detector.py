@@ -25,7 +25,7 @@ from slam.bodies.fits import fit_positions, fit_velocities, make_room, record, r
 from slam.bodies.following import follow, located, observed
 from slam.bodies.frame import NO_IDS, Frame, Setup, recent_poses, with_estimate
 from slam.bodies.membership import merge
-from slam.bodies.proof import PROOF, Way, with_frame
+from slam.bodies.proof import Way, with_frame
 from slam.bodies.regions import Region, follow_regions
 from slam.data import BoolArray, Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import among, median
@@ -211,13 +211,14 @@ class MovingObjectDetector(ObjectDetector):
 
     def _change_members(self, tracks: Tracks, frame: Frame) -> None:
         """Update the bodies' members; bodies that do not move are dropped."""
-        gains = membership.update_members(self.bodies, frame, tracks)
+        said = membership.update_members(self.bodies, frame, tracks)
         for id, body in list(self.bodies.items()):
-            typical = median(gains[id]) if len(gains.get(id, ())) else 0.0
-            body = self.bodies[id] = with_evidence(body, typical)
-            if id in gains and typical <= 0 and not body.proven:
+            gains, against = said.get(id, (np.zeros(0), 0))
+            typical = median(gains) if len(gains) else 0.0
+            body = self.bodies[id] = with_evidence(body, typical, int((gains > membership.CLEAR).sum()), against)
+            if id in said and typical <= 0 and not body.proven:
                 self._drop(tracks, body)
-            elif id in gains:
+            elif id in said:
                 mine = np.flatnonzero((tracks.body == id) & tracks.sure)
                 self.bodies[id] = with_extent(body, tracks.local[mine])
         merge(self.bodies, tracks)
@@ -252,8 +253,7 @@ class MovingObjectDetector(ObjectDetector):
             scene = scenes[None if whole is None else whole.id]
             moved, way = finder.moved_in(whole, tracks, members, frame), Way.of(body, frame, whole)
             evidence, counts = with_frame(body.evidence, moved, scene, way, body.far)
-            certain = body.certain + counts
-            body = replace(body, evidence=evidence, certain=certain, proven=body.proven or certain >= PROOF)
+            body = replace(body, evidence=evidence, certain=body.certain + counts)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= WINDOW:
                 self._drop(tracks, body)

@@ -34,7 +34,7 @@ _EDGE = 0.1  # as a share of its diagonal: the outermost points lie beyond the p
 _LOOSE = 4.0  # by how much it may exceed the 99 % limit then
 _BETTER = 6.0  # by how much χ² the body must explain a track better than the still world does, for it to join, and
 _BETTER_INSIDE = -4.0  # where it lies inside
-_WORSE = -9.0  # a member for which the still world is better by more leaves
+CLEAR = 9.0  #: a track for which the still world is better by more is no member, or leaves
 _MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
 _ENOUGH = 6  # frames after which a member must fit, and after which one that did not may join again
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
@@ -105,27 +105,22 @@ def _release(tracks: Tracks, rows: IndexArray) -> None:
     fit_positions(tracks, rows)
 
 
-def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> dict[int, Array]:
+def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> dict[int, tuple[Array, int]]:
     """Add the tracks that fit a measured body to its members, and remove those that do not, in place.
 
     Inside a body that stereo resolves no proof of motion is needed. Returns by how much χ² each body explains its seen
-    members better than the still world (K,).
+    members better than the still world (K,), and for how many others inside it the still world is clearly better.
     """
-    gains: dict[int, Array] = {}
+    said: dict[int, tuple[Array, int]] = {}
     bodies = {id: body for id, body in every.items() if body.measured}
-    for body in bodies.values():
-        _improve(body, tracks, frame.slot)
-        gains[body.id] = _expel(body, tracks)
-    if not bodies:
-        return gains
-    free = np.flatnonzero((tracks.body < 0) & tracks.found & ~tracks.still)
+    kept = {body.id: _expel(_improve(body, tracks, frame.slot), tracks) for body in bodies.values()}
+    free = np.flatnonzero((tracks.body < 0) & tracks.found)
     free = free[tracks.count(free) >= 2]
     best, whose = np.full(len(free), -np.inf), np.full(len(free), -1)
     for body in bodies.values():
         near = np.flatnonzero(_distances(body, tracks, free, MARGIN) < _NEAR)
-        if not len(near):
-            continue
-        gain = _gain_of_joining(body, frame.resolves(body.T[:3, 3]), tracks, free[near])
+        gain, against = _gain_of_joining(body, frame.resolves(body.T[:3, 3]), tracks, free[near])
+        said[body.id] = kept[body.id], against
         better = gain > best[near]
         best[near[better]], whose[near[better]] = gain[better], body.id
     for body in bodies.values():
@@ -133,16 +128,21 @@ def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> d
         streak = tracks.streak[mine]
         add_members(body, tracks, mine)
         tracks.streak[mine] = streak  # they may be of a part that is about to be found
-    return gains
+    return said
 
 
-def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: IndexArray) -> Array:
-    """By how much χ² a body explains tracks (N,) better than the still world; −∞ for those that may not join it."""
+def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: IndexArray) -> tuple[Array, int]:
+    """By how much χ² a body explains tracks (N,) better than the still world; −∞ for those that may not join it.
+
+    And how many of them stand still inside it.
+    """
     inside = _distances(body, tracks, rows, _EDGE) < _INSIDE
     proof = tracks.expelled[rows] | (not resolved)
     gain, fits, count = membership_test(body, tracks, rows)
     better = gain > np.where(inside & ~proof, _BETTER_INSIDE, _BETTER)
-    return np.where(better & fits & (count >= np.where(proof, _ENOUGH, 2)), gain, -np.inf)
+    joins = better & fits & (count >= np.where(proof, _ENOUGH, 2)) & ~tracks.still[rows]
+    against = (_distances(body, tracks, rows, 0.0) == 0.0) & (gain < -CLEAR)
+    return np.where(joins, gain, -np.inf), int(against.sum())
 
 
 def _expel(body: Body, tracks: Tracks) -> Array:
@@ -155,7 +155,7 @@ def _expel(body: Body, tracks: Tracks) -> Array:
     most_fit = fits[seen].sum() > _MOST * seen.sum()
     unfit = ~fits & (count >= _ENOUGH) & most_fit
     stays = tracks.still[mine] & (body.moving | ~tracks.sure[mine])
-    wrong = stays | (tracks.misfit[mine] >= RUN) | (seen & ((gain < _WORSE) | unfit))
+    wrong = stays | (tracks.misfit[mine] >= RUN) | (seen & ((gain < -CLEAR) | unfit))
     tracks.sure[mine] |= fits & (gain > _BETTER)
     if wrong.any():
         remove_members(tracks, mine[wrong & ~seen], body)
@@ -255,8 +255,8 @@ def _distances(body: Body, tracks: Tracks, rows: IndexArray, margin: float) -> A
     return np.asarray((away * times_vectors(P, away)).sum(axis=1))
 
 
-def _improve(body: Body, tracks: Tracks, slot: int) -> None:
-    """Take this frame's measurements into the members' points."""
+def _improve(body: Body, tracks: Tracks, slot: int) -> Body:
+    """Take this frame's measurements into the members' points, in place; returns the body."""
     t, R = tracks, body.T[:3, :3]
     mine = np.flatnonzero((t.body == body.id) & (t.misfit == 0) & (t.dof[:, slot] > 0))
     gap = (t.p[mine, slot] + t.anchor[mine] - body.T[:3, 3]) @ R - t.local[mine]
@@ -264,6 +264,7 @@ def _improve(body: Body, tracks: Tracks, slot: int) -> None:
     total = t.local_information[mine] + turned
     t.local_information[mine] = total
     t.local[mine] += times_vectors(inverses(total, RIDGE, 0.0), times_vectors(turned, gap))
+    return body
 
 
 def _still(tracks: Tracks, rows: IndexArray, known: BoolArray) -> Array:

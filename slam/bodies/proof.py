@@ -31,7 +31,6 @@ from slam.geometry.se3 import Array, inverse, points_by_pose
 
 PROVEN = 12.0  #: −log10 of the chance from which a body has moved for certain if it went farther than the camera; at 8
 #: the same bodies are found in `boxes` and on drives, and twice as many pieces of a walker
-PROOF = 4  #: by frames that are certain by both tests, each of which counts twice, or by way and turn together
 _SLIDES = 20.0  # the same elsewhere: what slides with the camera was seen to agree by up to some 1e-19
 _FARTHER = 2.0  # times the camera's way; from 2 to 4 nothing changes, at 1 what slides in EuRoC MH_01 is a body
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves

@@ -200,11 +200,12 @@ class SelfCalibration:
     def _compare(self, view: View) -> None:
         """Compare a view with the earlier ones, oldest first, until one still overlaps too much and keeps waiting."""
         c, waiting = self.config, self._waiting
+        with_last = match(waiting[-1], view) if waiting else None
         # 0.5: a new view is taken when the last one has lost this share of the features it may lose
-        apart = not waiting or len(match(waiting[-1], view)) < (1 - 0.5 * (1 - c.kept_share)) * len(waiting[-1])
+        apart = with_last is None or len(with_last) < (1 - 0.5 * (1 - c.kept_share)) * len(waiting[-1])
         ended = 0
         for first in waiting:
-            matched = match(first, view)
+            matched = with_last if with_last is not None and first is waiting[-1] else match(first, view)
             if len(matched) > max(c.kept_share * len(first), c.minimum_common):
                 break
             ended += 1

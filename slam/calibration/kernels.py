@@ -45,12 +45,56 @@ def field(points, focal):
 
 
 @kernel
-def fit(first, second, R, t, focal, noise, median):
-    """Gauss-Newton of `slam.calibration.pairs.fit_motion`; see there for the arguments.
+def shift(points, focal, amounts):
+    """Change (N, 4) [px] of points (N, 3) [px] and of their vertical disparities by amounts (n + 3,) of the columns."""
+    out, columns = np.zeros((len(points), 4)), np.zeros((4, 24))
+    for p in range(len(points)):
+        _field_at(points[p, 0] / focal, points[p, 1] / focal, points[p, 2] / focal, focal, columns)
+        for i in range(4):
+            for j in range(24):
+                out[p, i] += columns[i, j] * amounts[j]
+    return out
 
-    Points are weighted by Student's t distribution of four degrees of freedom, `median` being that of χ². Returns the
-    fields of `slam.calibration.pairs.Fit`, and the last change of a predicted point [px], infinite where there is no
-    solution.
+
+@kernel
+def residual_field(points, focal, centre, half, degrees):
+    """Change (N, 4, m) [px] of points (N, 3) [px] and of their vertical disparities by the residual fields.
+
+    The image has its `centre` and half sizes in focal lengths; `degrees` are the polynomials' in x and y.
+    """
+    k = (degrees[0] + 1) * (degrees[1] + 1) - 3
+    out, values = np.zeros((len(points), 4, 4 * k)), np.ones((2, max(degrees) + 1))
+    for p in range(len(points)):
+        for side in range(2):
+            for axis in range(2):
+                at = points[p, axis] - (points[p, 2] if side > axis else 0.0)
+                at = (at / focal - centre[axis]) / half[axis]
+                # 1.1: half widths from the centre, beyond which they are held constant; NaN stays NaN
+                at = 1.1 if at > 1.1 else -1.1 if at < -1.1 else at
+                values[axis, 1] = at
+                for i in range(2, degrees[axis] + 1):
+                    values[axis, i] = ((2 * i - 1) * at * values[axis, i - 1] - (i - 1) * values[axis, i - 2]) / i
+            column = 2 * k * side
+            for i in range(degrees[0] + 1):
+                for j in range(degrees[1] + 1):
+                    if i + j > 1:  # for a mean square of one over the image
+                        value = focal * np.sqrt((2 * i + 1) * (2 * j + 1)) * values[0, i] * values[1, j]
+                        if side == 0:
+                            out[p, 0, column] = value
+                            out[p, 1, column + k] = value
+                        out[p, 2, column] = -value if side else value
+                        out[p, 3, column + k] = value if side else -value
+                        column += 1
+    return out
+
+
+@kernel
+def fit(first, second, R, t, focal, noise, median, steps):
+    """Gauss-Newton of `slam.calibration.pairs.fit_motion`, of some steps at most; see there for the arguments.
+
+    Without any, the problem is linearised at the first guess. Points are weighted by Student's t distribution of four
+    degrees of freedom, `median` being that of χ². Returns the fields of `slam.calibration.pairs.Fit`, and the last
+    change of a predicted point [px], infinite where there is no solution.
     """
     n, last = len(first), np.inf
     R, t, points, weights = R.copy(), t.copy(), first.copy(), np.empty(len(first))
@@ -58,8 +102,10 @@ def fit(first, second, R, t, focal, noise, median):
     _, J_point, J_motion, residual, information = at
     H, step, turn, before = np.empty((6, 6)), np.empty(6), np.empty((3, 4)), np.empty((3, 3))
     rest, weighted = np.empty(3), np.empty(3)
-    for _ in range(20):  # 20: iterations at most
+    for _ in range(max(steps, 1)):
         _linearise(first, second, points, R, t, focal, noise, *at)
+        if steps == 0:
+            break
         total = 0.0
         for p in range(n):
             weights[p] = square(information[p], residual[p])
@@ -111,7 +157,7 @@ def fit(first, second, R, t, focal, noise, median):
 
 @helper
 def _linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motion, residual, information):
-    """`linearise` into arrays."""
+    """Fill in the fields of `slam.calibration.pairs.Linear`, at a motion and estimates of the first view's points."""
     by_all, by_depth, B, C = np.empty((3, 9)), np.empty(9), np.empty((3, 3)), np.empty((3, 3))
     for p in range(len(points)):
         x, y, d = points[p, 0], points[p, 1], points[p, 2]
@@ -150,12 +196,3 @@ def _linearise(first, second, points, R, t, focal, noise, moved, J_point, J_moti
                 for k in range(3):
                     C[i, j] += B[i, k] * J_point[p, j, k]
         invert_symmetric(C, 0.0, information[p])
-
-
-@kernel
-def linearise(first, second, points, R, t, focal, noise):
-    """The fields of `slam.calibration.pairs.Linear`; see `slam.calibration.pairs.linearised` for the arguments."""
-    n = len(points)
-    out = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6)), np.empty((n, 3)), np.empty((n, 3, 3))
-    _linearise(first, second, points, R, t, focal, noise, *out)
-    return out

@@ -28,10 +28,8 @@ _UNITS = {"cx": "focal lengths", "cy": "focal lengths", "pitch": "rad", "yaw": "
 
 #: Products of Legendre polynomials in x and y, up to these degrees, for what no lens model holds. Constant and linear
 #: ones are left out: `LENS` and `POSE` have them.
-_DEGREES = [5, 3]
+_DEGREES = 5, 3
 RESIDUAL = tuple((i, j) for i in range(_DEGREES[0] + 1) for j in range(_DEGREES[1] + 1) if i + j > 1)
-_COLUMNS = [(_DEGREES[1] + 1) * i + j for i, j in RESIDUAL]  # of all products
-_SCALES = np.array([np.sqrt((2 * i + 1) * (2 * j + 1)) for i, j in RESIDUAL])  # for a mean square of one over the image
 
 
 class RigModel:
@@ -83,8 +81,11 @@ class RigModel:
         return np.asarray(field[:, :, :n] + field[:, :, n:] @ self._gauge)
 
     def shift(self, points: Array, parameters: Array) -> Array:
-        """Change (N, 3) [px] of points ``(x, y, d)`` (N, 3) [px] by parameters (n,)."""
-        return np.asarray(self.field(points)[:, :3] @ parameters)
+        """Change (N, 4) [px] of points ``(x, y, d)`` (N, 3) [px] and of vertical disparities by parameters (n,)."""
+        from slam.calibration.kernels import shift
+
+        amounts = np.concatenate([parameters, self._gauge @ parameters])
+        return np.asarray(shift(np.ascontiguousarray(points, float), self.focal, amounts))
 
     @cached_property
     def _gauge(self) -> Array:
@@ -95,18 +96,10 @@ class RigModel:
 
     def residual_field(self, points: Array) -> Array:
         """As `field`, by the residual fields (N, 4, m): of x and y of the left camera, then of the right one."""
-        x, y, d = points.T / self.focal
-        left, right = (self.focal * self._polynomials(v, y) for v in (x, x - d))
-        o = np.zeros_like(left)
-        rows = [left, o, o, o], [o, left, o, o], [left, o, -right, o], [o, -left, o, right]
-        return np.stack([np.concatenate(row, axis=1) for row in rows], axis=1)
+        from slam.calibration.kernels import residual_field
 
-    def _polynomials(self, x: Array, y: Array) -> Array:
-        """Products of Legendre polynomials (N, k), with a mean square of one over the image."""
-        at = (np.column_stack([x, y]) - self._centre) / self._half
-        u, v = np.clip(at, -1.1, 1.1).T  # 1.1: half widths from the centre, beyond which they are held constant
-        products: Array = np.polynomial.legendre.legvander2d(u, v, _DEGREES)
-        return np.asarray(_SCALES * products[:, _COLUMNS])
+        points = np.ascontiguousarray(points, float)
+        return np.asarray(residual_field(points, self.focal, self._centre, self._half, _DEGREES))
 
 
 def field_and_turn(points: Array, focal: float) -> Array:
@@ -126,20 +119,20 @@ class RigCorrection:
     def rows(self, z: Array) -> Array:
         """Corrected rectified rows (uL, vL, uR) (N, 3) of measured ones [px]; uR NaN stays NaN."""
         points = self.model.points(z)
-        return self.model.rows(points + self.model.shift(points, self.parameters))
+        return self.model.rows(points + self.model.shift(points, self.parameters)[:, :3])
 
     def undone(self, z: Array) -> Array:
         """Measured rows (N, 3) of corrected ones: the inverse of `rows`."""
         corrected = points = self.model.points(z)
         for _ in range(4):  # 4: fixed-point iterations that undo a correction; each reduces the error some 30 times
-            points = corrected - self.model.shift(points, self.parameters)
+            points = corrected - self.model.shift(points, self.parameters)[:, :3]
         return self.model.rows(points)
 
     def features(self, features: StereoFeatures) -> StereoFeatures:
         """Features with both pixels corrected; the right row keeps the remaining vertical disparity."""
         left, right = features.uv_left, features.uv_right
         points = self.model.points(np.column_stack([left, right[:, 0]]))
-        change = self.model.field(points) @ self.parameters
+        change = self.model.shift(points, self.parameters)
         z, vertical = self.model.rows(points + change[:, :3]), right[:, 1] - left[:, 1] + change[:, 3]
         return replace(features, uv_left=z[:, :2], uv_right=np.column_stack([z[:, 2], z[:, 1] + vertical]))
 

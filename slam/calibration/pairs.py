@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import Evidence
@@ -75,29 +76,36 @@ def pair_of(
     of the random choice in the geometric check.
     """
     seen = first.points[matched.tracks], second.points[matched.features]
-    one, two = (points + model.shift(points, parameters) for points in seen)
-    T: Array = inverse(second.T_world_left) @ first.T_world_left
-    near = (one[:, 2] > 1.0) & (two[:, 2] > 1.0)  # 1.0: least disparity of a point that helps to find the motion [px]
+    one, two = (points + model.shift(points, parameters)[:, :3] for points in seen)
     rig = model.rig.rectified.rig
-    if near.sum() >= 3:
+    T: Array = inverse(second.T_world_left) @ first.T_world_left
+    R, t = T[:3, :3], T[:3, 3] / rig.baseline
+    agree = _agreeing(model, one, two, R, t)
+    near = (one[:, 2] > 1.0) & (two[:, 2] > 1.0)  # 1.0: least disparity of a point that helps to find the motion [px]
+    if 2 * agree.sum() < len(agree) and near.sum() >= 3:
         before, after = model.rows(one[near]), model.rows(two[near])
         local = rig.triangulate(before[:, :2], before[:, [2, 1]])
         # 100: poses tried in the geometric check of a pair of views
         found = find_consensus(rig, local, after, inverse(T), _AGREES, 100, seed)
         T = np.asarray(inverse(found.T_world_left))
-    R, t = T[:3, :3], T[:3, 3] / rig.baseline
-    moved, J, _ = move(one, R, t, model.focal)
-    with np.errstate(invalid="ignore"):
-        agree = (np.abs(moved - two) <= _EACH * np.sqrt(1 + np.square(J).sum(axis=2))).all(axis=1)
+        R, t = T[:3, :3], T[:3, 3] / rig.baseline
+        agree = _agreeing(model, one, two, R, t)
     for _ in range(2):  # 2: times that motion and inliers are recomputed
         fitted = fit_motion(one[agree], two[agree], R, t, model.focal, noise) if agree.sum() >= 3 else None
         if fitted is None:
             break
         R, t = fitted.R, fitted.t
-        distance = linearised(one, two, one, R, t, model.focal, noise).squared
+        distance = linearised(one, two, R, t, model.focal, noise).squared
         # 16.3: χ²(3) at 99.9 %, largest squared distance of a match that agrees
         agree = distance <= 16.3 * median(distance[agree]) / _MEDIAN_3
     return Pair(one[agree], two[agree], R, t)
+
+
+def _agreeing(model: RigModel, first: Array, second: Array, R: Array, t: Array) -> NDArray[np.bool_]:
+    """Which points (N,) of two views agree with a motion."""
+    moved, J, _ = move(first, R, t, model.focal)
+    with np.errstate(invalid="ignore"):
+        return (np.abs(moved - second) <= _EACH * np.sqrt(1 + np.square(J).sum(axis=2))).all(axis=1)
 
 
 class Linear(NamedTuple):
@@ -133,12 +141,9 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
     `R` (3, 3) and `t` (3,) [baselines] a first guess. Points are weighted by Student's t distribution, whose scale is
     estimated, so that of the `noise`, a point's covariance (3, 3) [px²], only the form matters.
     """
-    from slam.calibration.kernels import fit
-
-    arrays = (np.ascontiguousarray(a, float) for a in (first, second, R, t))
-    R, t, points, at, weights, last = fit(*arrays, focal, noise, _MEDIAN_3)
+    fitted, last = _fitted(first, second, R, t, focal, noise, 20)  # 20: iterations at most
     # 3e-3: change of a predicted point [px] in the last iteration: in some pairs single points oscillate
-    return Fit(R, t, points, Linear(*at), weights) if last < 3e-3 else None
+    return fitted if last < 3e-3 else None
 
 
 def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) -> Evidence | None:
@@ -193,16 +198,24 @@ def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array,
     shares, with D the true disparity. It has no singularity at infinity, where D = 0. Returns moved points (N, 3),
     Jacobians by the points (N, 3, 3), and by ``[rotation (left), t]`` (N, 3, 6).
     """
-    return linearised(points, points, points, R, t, focal, np.eye(3))[:3]
+    return linearised(points, points, R, t, focal, np.eye(3))[:3]
 
 
-def linearised(first: Array, second: Array, points: Array, R: Array, t: Array, focal: float, noise: Array) -> Linear:
-    """A motion linearised at estimates of the first view's points (N, 3); for the arguments see `fit_motion`.
+def linearised(first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array) -> Linear:
+    """A motion linearised at the first view's points; for the arguments see `fit_motion`.
 
     The residuals carry the points' own corrections to first order. The motion amplifies the disparity errors of near
     points, so that a limit in pixels would keep only points whose errors happen to be small.
     """
-    from slam.calibration.kernels import linearise
+    return _fitted(first, second, R, t, focal, noise, 0)[0].linear
 
-    arrays = (np.ascontiguousarray(a, float) for a in (first, second, points, R, t))
-    return Linear(*linearise(*arrays, focal, noise))
+
+def _fitted(
+    first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array, steps: int
+) -> tuple[Fit, float]:
+    """The motion after `steps` at most, and the last change of a predicted point [px], infinite without a solution."""
+    from slam.calibration.kernels import fit
+
+    arrays = (np.ascontiguousarray(a, float) for a in (first, second, R, t))
+    R, t, points, at, weights, last = fit(*arrays, focal, noise, _MEDIAN_3, steps)
+    return Fit(R, t, points, Linear(*at), weights), float(last)

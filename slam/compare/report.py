@@ -12,7 +12,7 @@ import numpy as np
 
 from slam.compare import tables
 from slam.compare.plan import Plan, is_world
-from slam.compare.statistics import FEWEST, LEVEL, Verdict
+from slam.compare.statistics import LEVEL, Verdict
 from slam.compare.sweep import SWEEP, Run
 from slam.compare.tables import Group
 from slam.files import read_object, write_text
@@ -54,7 +54,6 @@ def write_report(
         caution=tables.caution(max(group.trials for group in every), tables.most_tests(plan)),
         tests=tables.count_tests(every),
         strengths={verdict.value: tables.STRENGTH[verdict] for verdict in (Verdict.CERTAIN, Verdict.LIKELY)},
-        fewest=FEWEST,
         level=round(100 * LEVEL),
         sections=[(own, list(_pictures(own[0]))) for own in modes],
         workers=workers,

@@ -1,17 +1,14 @@
 """What follows from paired trials, and what does not.
 
 Two estimators run on the same recordings: the difference of each pair is free of how hard a recording was. Its mean
-over the trials is the effect. It has a 95 % bootstrap confidence interval (bias-corrected and accelerated, Efron 1987)
-and a p-value by the sign-flip permutation test (two-sided): how often so large a mean would come about if neither were
-better. Many figures are tested at once, so p is adjusted over all tests of a report (Holm 1979). With few trials the
-bootstrap is too sure of itself, while the test's p cannot fall below 2 / 2ᴺ; a difference needs both. With fewer than
-`FEWEST` trials there is no interval: even one from the smallest to the largest value would leave out the middle of what
-they were drawn from with probability 2 / 2ᴺ, more than the level allows.
+over the trials is the effect. It has Student's 95 % confidence interval and a p-value by the sign-flip permutation test
+(two-sided): how often so large a mean would come about if neither were better. Many figures are tested at once, so p is
+adjusted over all tests of a report (Holm 1979). The interval takes differences for normal ones, the test does not, but
+its p cannot fall below 2 / 2ᴺ; a difference needs both.
 """
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -28,7 +25,6 @@ LEVEL = 0.95
 #: p up to which a difference is significant: Holm-adjusted it is certain, before the adjustment likely.
 ALPHA = 0.05
 
-_RESAMPLES = 9999
 _SEED = 0
 _EXACT = 16  # pairs up to which all 2ᴺ patterns of signs are tried; for more as many are drawn
 
@@ -58,7 +54,7 @@ class Difference:
     reference: float  # mean over the pairs
     other: float
     mean: float  # of the differences, other less reference
-    low: float  # bounds of its confidence interval; NaN with fewer than `FEWEST` pairs
+    low: float  # bounds of its confidence interval; NaN with fewer than two pairs
     high: float
     p: float  # of the sign-flip test, two-sided; NaN with fewer than two pairs, and where nothing is better or worse
     p_holm: float  # adjusted over the tests of a report, see `adjusted`; `p` itself where there is no other test
@@ -137,27 +133,14 @@ def fewest(tests: int) -> int:
     return int(np.ceil(np.log2(2 * max(tests, 1) / ALPHA)))
 
 
-#: Values from which on a mean has a confidence interval.
-FEWEST = fewest(1)
-
-
 def interval(values: Array) -> tuple[float, float]:
-    """Bounds of the confidence interval of the mean of values (N,); NaN with fewer than `FEWEST`."""
-    if len(values) < FEWEST:
+    """Bounds of Student's confidence interval of the mean of values (N,); NaN with fewer than two."""
+    if len(values) < 2:
         return float("nan"), float("nan")
-    if np.ptp(values) == 0:  # no spread to resample
-        return float(values[0]), float(values[0])
-    from scipy.stats import bootstrap
+    from scipy.special import stdtrit
 
-    options = {"confidence_level": LEVEL, "n_resamples": _RESAMPLES}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # BCa says so where it is not defined; then percentiles are taken
-        for method in ("BCa", "percentile"):
-            rng = np.random.default_rng(_SEED)
-            low, high = bootstrap((values,), np.mean, method=method, rng=rng, **options).confidence_interval
-            if np.isfinite(low) and np.isfinite(high):
-                break
-    return float(low), float(high)
+    half = stdtrit(len(values) - 1, (1 + LEVEL) / 2) * values.std(ddof=1) / np.sqrt(len(values))
+    return float(values.mean() - half), float(values.mean() + half)
 
 
 def sign_flip(d: Array) -> float:

@@ -10,11 +10,10 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from slam.errors import SlamError
 from slam.files import noting_inputs, read_object
 from slam.input.features import Rectification
 from slam.outputs import Output, require_outputs
-from slam.run.options import changed_versions, running_code
+from slam.run.options import changed_versions, versions
 from slam.run.outputs import naming_folder, write_json
 from slam.sequences import open_sequence
 from slam.sequences.base import said_before
@@ -34,9 +33,6 @@ RUNS, SWEEP = "runs", "sweep.json"
 
 #: What a comparison leaves in its folder.
 NAMES = (SWEEP, f"{RUNS}/", "runs.csv", "differences.csv", "report.html")
-
-#: Outcome of a trial whose process died, and died again where it was run alone.
-KILLED = "failed: its process was killed: too little memory, perhaps"
 
 Job = tuple[Trial, Path, Path | None]  # arguments of `run_trial`
 
@@ -70,14 +66,14 @@ def sweep(
         overwrite: whether to run all again, and to replace files that are there.
 
     Raises:
-        SlamError: a sequence, name or setting is bad (nothing is run then), the folder holds something else, or no
-            worker process can be started.
+        SlamError: a sequence, name or setting is bad (nothing is run then), the folder holds something else, or a
+            worker process ended.
     """
     check(plan, out, overwrite)
     told = on_done or (lambda trial: None)
     with naming_folder(out):
         out.mkdir(parents=True, exist_ok=True)
-    write_json(out / SWEEP, {"trials": [asdict(trial) for trial in plan.every], "versions": running_code()})
+    write_json(out / SWEEP, {"trials": [asdict(trial) for trial in plan.every], "versions": versions()})
     for mode in plan.modes:  # a replay needs the closed loop
         jobs: list[Job] = []
         for trial in plan.trials_of(mode):
@@ -96,66 +92,30 @@ def sweep(
 def run_jobs(jobs: Sequence[Job], workers: int, told: Callable[[Trial], None]) -> None:
     """`run_trial` on each of these arguments in processes of its own; `told` of each that has ended.
 
-    Those whose process died are run once more, one at a time: of several at once one may have taken all memory. One
-    whose process dies again has failed. Raises SlamError where no process can be started.
+    Raises SlamError where a process dies or none can be started; the trials that have ended are kept.
     """
-    for trial, folder, _ in _killed(list(_killed(jobs, workers, told)), 1, told):
-        keep_result(trial, folder, KILLED)
-        told(trial)
-
-
-def _killed(jobs: Sequence[Job], workers: int, told: Callable[[Trial], None]) -> Iterator[Job]:
-    """Run jobs, each worker in a pool of its own; yields those whose process died."""
-    left, running = deque(jobs), dict[Future[None], tuple[ProcessPoolExecutor, Job]]()
-    with _pools() as new_pool:
-        idle = [new_pool() for _ in range(min(workers, len(jobs)))]
-        while left or running:
-            while left and idle:
-                pool = idle.pop()
-                try:
-                    future = pool.submit(run_trial, *left[0])
-                except BrokenProcessPool:  # its process died when it had no work
-                    idle.append(new_pool())
-                    continue
-                running[future] = pool, left.popleft()
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                pool, job = running.pop(future)
-                error = future.exception()
-                if isinstance(error, BrokenProcessPool):
-                    pool = new_pool()
-                    try:
-                        pool.submit(int).result()
-                    except BrokenProcessPool:
-                        raise SlamError(
-                            "no worker process can be started: a script must call this below "
-                            '`if __name__ == "__main__":`'
-                        ) from error
-                    yield job
-                else:
-                    if error is not None:
-                        keep_result(job[0], job[1], error)
-                    told(job[0])
-                idle.append(pool)
-
-
-@contextmanager
-def _pools() -> Iterator[Callable[[], ProcessPoolExecutor]]:
-    """Makes pools of one process, which end with this context however it ends."""
-    before, pools = set(multiprocessing.active_children()), list[ProcessPoolExecutor]()
-
-    def new_pool() -> ProcessPoolExecutor:
-        pools.append(ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin_worker))
-        return pools[-1]
-
+    before = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(max(1, min(workers, len(jobs))), multiprocessing.get_context("spawn"), _begin_worker)
     try:
-        yield new_pool
+        trials = {pool.submit(run_trial, *job): job for job in jobs}
+        for future in as_completed(trials):
+            trial, folder, _ = trials[future]
+            if (error := future.exception()) is not None:
+                if isinstance(error, BrokenProcessPool):
+                    raise error
+                keep_result(trial, folder, error)
+            told(trial)
+    except BrokenProcessPool as error:
+        raise SlamError(
+            "a worker process ended: too little memory, perhaps (see --workers), or a script that lacks "
+            '`if __name__ == "__main__":`; trials done so far are kept'
+        ) from error
     except BaseException:
         for process in set(multiprocessing.active_children()) - before:
             process.terminate()
         raise
     finally:
-        for pool in pools:
-            pool.shutdown(wait=True, cancel_futures=True)
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _begin_worker() -> None:
@@ -199,7 +159,7 @@ def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
         before, trials = held.get("versions"), held.get("trials")
         if not isinstance(before, dict) or not isinstance(trials, list):
             raise SlamError(f"{out / SWEEP}: not that of a comparison")
-        if changed := changed_versions(dict.fromkeys(running_code(), "unknown") | before, running_code()):
+        if changed := changed_versions(dict.fromkeys(versions(), "unknown") | before, versions()):
             raise SlamError(f"{out}: begun with {changed[0]}: runs cannot be compared; give another --out")
         if not set(map(json.dumps, trials)) <= {json.dumps(asdict(trial)) for trial in plan.every}:
             raise SlamError(f"{out}: holds a comparison of more or other runs; give another --out, or --overwrite")

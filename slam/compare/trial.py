@@ -76,7 +76,8 @@ def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:
     if name == "surf":
         first = ["frontend.threads=1"]  # what it finds does not depend on it
     if name == SIMULATED and isinstance(sequence, WorldSequence) and sequence.values["sigma"]:
-        first = [f"models.pixel_sigma={sequence.values['sigma']}"]  # the noise of these features is known
+        # the noise of these features is known
+        first = [f"models.pixel_sigma={sequence.values['sigma']}", "models.slide.density=0"]
     return SystemConfig.for_kind(sequence.kind, name).with_settings([*first, *trial.variant.settings])
 
 

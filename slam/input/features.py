@@ -144,12 +144,13 @@ class Rectification:
             raise ConfigurationError("the back end works behind rectification: make it with rig.rectified.rig")
 
     def models(self, models: EstimatorModels) -> EstimatorModels:
-        """Models for the rectified pair: noise and drift of its pixels, and the first pose of its left camera."""
+        """Models for the rectified pair: what its pixels do, and the first pose of its left camera."""
         if self._none:
             return models
         T, scale = models.initial_pose @ self._ways.T_left_rectified, self._ways.scale
         objects = replace(models.objects, drift=models.objects.drift * scale)
-        return replace(models, pixel_sigma=models.pixel_sigma * scale, T_world_left=T.tolist(), objects=objects)
+        slide, sigma = replace(models.slide, density=models.slide.density * scale), models.pixel_sigma * scale
+        return replace(models, pixel_sigma=sigma, slide=slide, T_world_left=T.tolist(), objects=objects)
 
     def features_in(self, features: StereoFeatures) -> StereoFeatures:
         """Features in pixels of the rectified pair; those outside of its left image are left out."""

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -80,12 +77,14 @@ def parse_frames(text: str | None) -> tuple[int, int | None]:
 
 
 def origin(options: RunOptions) -> dict[str, Any]:
-    """What ``config.json`` says besides names and settings: the command, and files by absolute path."""
+    """What ``config.json`` says besides names: the command, frames, settings, versions, and files by absolute path."""
+    run = {"command": options.command, "frames": [options.start, options.stop], "versions": versions()}
+    run["settings"] = _portable(options.config.to_json())
     if not options.source:  # of a recording, or a sequence made in Python
-        return {"command": options.command}
+        return run
     files = {"prior_map": options.prior_map, "calibration": options.calibration}
     return {
-        "command": options.command,
+        **run,
         "source": options.source if options.format in ("synthetic", "camera") else _place(options.source),
         "source_format": options.format,
         "kind": options.kind,
@@ -138,37 +137,24 @@ def versions() -> dict[str, str]:
     return found
 
 
-@cache
-def running_code() -> dict[str, str]:
-    """`versions`, and twelve hex digits for the sources of this distribution as ``code``; looked up once."""
-    digest = hashlib.sha256()
-    for name in ("slam", "frontends", "backends"):
-        spec = find_spec(name)
-        for root in () if spec is None else map(Path, spec.submodule_search_locations or ()):
-            for path in sorted(root.rglob("*.py")):
-                place = f"{root.name}/{path.relative_to(root).as_posix()}"
-                digest.update(f"{place}\0".encode() + path.read_bytes() + b"\0")
-    return {**versions(), "code": digest.hexdigest()[:12]}
-
-
 def changed_versions(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """What differs between two sets of versions, in words."""
     return [f"{name} {old}, now {now.get(name)}" for name, old in then.items() if now.get(name) != old]
 
 
-def portable(tree: Any) -> Any:
+def _portable(tree: Any) -> Any:
     """The tree with infinite numbers, which JSON does not have, as ``"Infinity"`` and ``"-Infinity"``."""
     if isinstance(tree, Mapping):
-        return {key: portable(value) for key, value in tree.items()}
+        return {key: _portable(value) for key, value in tree.items()}
     if isinstance(tree, (list, tuple)):
-        return [portable(value) for value in tree]
+        return [_portable(value) for value in tree]
     if isinstance(tree, float) and math.isinf(tree):
         return "Infinity" if tree > 0 else "-Infinity"
     return tree
 
 
 def _restored(tree: Any) -> Any:
-    """The inverse of `portable`."""
+    """The inverse of `_portable`."""
     if isinstance(tree, dict):
         return {key: _restored(value) for key, value in tree.items()}
     if isinstance(tree, list):

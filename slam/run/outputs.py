@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -17,7 +16,7 @@ import numpy as np
 from slam.atlas.atlas import Atlas
 from slam.data import Estimate, FrameResult
 from slam.errors import SlamError
-from slam.files import RowFile, lock_folder, reason, remove_file, write_text
+from slam.files import RowFile, reason, remove_file, write_text
 from slam.geometry.se3 import Array, angles, transform
 from slam.geometry.trajectory import Trajectory, tum_line
 from slam.object_data import MovingObject
@@ -37,9 +36,8 @@ _NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\s+\]")  # as json indents th
 class RunFiles(ExitStack):
     """Writer of a run's folder; a context manager that closes the files.
 
-    The folder is made where there is none, and locked meanwhile: two runs in one would spoil each other's files, and
-    SlamError says so. Files of an earlier run are overwritten. Each method raises SlamError where a file cannot be
-    written: a whole one is then as it was, and of rows those before stay.
+    The folder is made where there is none. Files of an earlier run are overwritten. Each method raises SlamError where
+    a file cannot be written: a whole one is then as it was, and of rows those before stay.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -49,9 +47,6 @@ class RunFiles(ExitStack):
         with ExitStack() as opened, naming_folder(folder):
             self._made += [path for path in (folder, *folder.parents) if not path.exists()]
             folder.mkdir(parents=True, exist_ok=True)
-            lock = lock_folder(folder)
-            if lock is not None:
-                opened.callback(os.close, lock)
             for name in set(NAMES).difference(_ROWS):
                 remove_file(folder / name)
             self._trajectory, self._frames, self._objects = (

@@ -29,7 +29,7 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.models import EstimatorModels, MotionModel, ObjectModels, models_for
+from slam.models import EstimatorModels, MotionModel, ObjectModels, SlideModel, models_for
 
 _HEADER = {"format": "surf-stereo-slam recording", "version": 3}
 _LARGEST = 2**32  # bytes of a file
@@ -103,7 +103,8 @@ def _recording(arrays: dict[str, np.ndarray]) -> Recording:
     tree, models = header["rig"], header["models"]
     left, right = (PinholeCamera(**{**tree[s], "distortion": tuple(tree[s]["distortion"])}) for s in ("left", "right"))
     rig = StereoRig(left, right, np.array(tree["R"], float), np.array(tree["b"], float))
-    models |= {"motion": MotionModel(**models["motion"]), "objects": ObjectModels(**models["objects"])}
+    parts = {"motion": MotionModel, "slide": SlideModel, "objects": ObjectModels}
+    models |= {name: kind(**models.get(name, {})) for name, kind in parts.items()}
     models_for(header["kind"])
     if not isinstance(header["name"], str):
         raise SequenceError("its name is no text")

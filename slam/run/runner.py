@@ -21,13 +21,12 @@ from slam.geometry.trajectory import Trajectory
 from slam.input.features import Rectification
 from slam.interfaces import Frontend
 from slam.outputs import require_outputs
-from slam.run.options import RunOptions, origin, portable, versions
+from slam.run.options import RunOptions, origin, versions
 from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
 from slam.run.outputs import RunFiles, write_json, write_trajectory
 from slam.run.recording import RecordedFrame, Recording, save_recording
 from slam.run.replay import replay
 from slam.run.schema import schema
-from slam.run.settings_reference import in_force
 from slam.run.summary import Replayed, RunRecord, live_frames, results_of
 from slam.run.warm_up import warm_up
 from slam.runtime.threads import one_blas_thread
@@ -169,7 +168,7 @@ class _Run:
         names |= {"frontend": options.frontend, "backend": options.backend}
         ended, stopped_by = "completed", None
         with RunFiles(options.out) as files:
-            write_json(options.out / "config.json", origin(options) | names | self._config())
+            write_json(options.out / "config.json", origin(options) | names)
             self._attempt(write_json, options.out / "schema.json", schema())
             try:
                 for number, result in results:
@@ -194,17 +193,6 @@ class _Run:
                     files.discard()
                 self._raise_failures(stopped_by)
         return summary
-
-    def _config(self) -> dict[str, Any]:
-        """What is run; ``in_force`` are all options of front end and back end, also those left at their defaults."""
-        parts = {"frontend": getattr(self.system, "frontend", None), "backend": self.system.backend}
-        options = {name: in_force(part) for name, part in parts.items()}
-        return {
-            "frames": [self.options.start, self.options.stop],
-            "settings": portable(self.options.config.to_json()),
-            "in_force": {name: portable(found) for name, found in options.items() if found is not None},
-            "versions": versions(),
-        }
 
     def _place(self, step: int | None) -> int | str:
         """The frame whose place was seen again, ``map`` for one of the map that the run started in; empty for none."""

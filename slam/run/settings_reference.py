@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import dataclass
 from functools import reduce
 from inspect import cleandoc
 from textwrap import wrap
@@ -120,9 +120,3 @@ def documented(kind: Any) -> dict[str, tuple[str, str]]:
                 unit = units[i] if len(units) == len(each) else units[0] if units else ""
                 found[name] = unit, plain.replace("``", "").rstrip(".")
     return found
-
-
-def in_force(part: object) -> dict[str, Any] | None:
-    """All options of a front end or back end that it runs with; None where it has no configuration to tell."""
-    config = getattr(part, "config", None)
-    return asdict(config) if is_dataclass(config) and not isinstance(config, type) else None

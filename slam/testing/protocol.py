@@ -275,3 +275,56 @@ def removed_landmarks_are_gone(factory: Factory) -> None:
     assert_near(backend.estimate().T_world_left, scene.poses[-1], "pose after removals")
     back = gone[np.isin(gone, scene.frames[-1].ids)]
     require(len(back) > 0 and np.isin(back, backend.estimate().ids).all(), "a removed id could not come back")
+
+
+def queries_are_pure(factory: Factory) -> None:
+    """Of two twins one is asked for everything at every step, the other never: they go on to the same bytes."""
+    scene, dark = make_scene(14), (5, 6, 11)
+    asked, silent = Run(factory), Run(factory)
+    other = "of a back end that was asked before, against one that was not"
+    for k, seen in enumerate(scene.frames):
+        seen = seen.select(np.zeros(0, np.intp)) if k in dark else seen
+        answers = [run.step(k, seen, between=_ask if run is asked else None) for run in (asked, silent)]
+        if k == 8:
+            for run in (asked, silent):
+                run.backend.remove(seen.ids[:4])
+                run.in_backend -= set(seen.ids[:4].tolist())
+        _ask(asked.backend)
+        for what, a, b in zip(("prediction", "report"), *answers):
+            require_equal(a, b, f"{what} of frame {k} {other}")
+        if k in dark:
+            a, b = (run.backend.estimate(landmarks=False) for run in (asked, silent))
+            require_equal(a, b, f"pose of frame {k} {other}")
+    require_equal(asked.backend.trajectory(), silent.backend.trajectory(), f"path {other}")
+    require_equal(asked.backend.estimate(), silent.backend.estimate(), f"estimate {other}")
+
+
+def _ask(backend: Backend) -> None:
+    """Every question, twice."""
+    for _ in range(2):
+        backend.estimate(landmarks=False)
+        backend.positions(backend.estimate().ids)
+        backend.trajectory()
+        if hasattr(backend, "recent"):
+            backend.recent(4)
+
+
+def rows_that_no_point_explains_are_rejected(factory: Factory) -> None:
+    """An update with a row of negative disparity, or far outside the image, rejects that row and uses the others."""
+    scene, run = make_scene(6), Run(factory)
+    for k in range(5):
+        run.step(k, scene.frames[k])
+    seen = scene.frames[5].select(run.in_map(scene.frames[5]))
+    left, right = seen.uv_left.copy(), seen.uv_right.copy()
+    right[1, 0] = left[1, 0] + 50.0
+    left[2], right[2] = (9e4, -9e4), (9e4 - 20.0, -9e4)
+    run.backend.predict(5 * DT)
+    report = run.backend.update(replace(seen, uv_left=left, uv_right=right))
+    require_status(report, UpdateStatus.OK, "an update with two wrong rows")
+    require(np.isin(seen.ids[[1, 2]], report.rejected).all(), "a row that no point explains was not rejected")
+    estimate = run.backend.estimate()
+    finite = np.isfinite(estimate.T_world_left).all() and np.isfinite(estimate.positions).all()
+    require(finite, "pose or landmarks are not finite after an update with two wrong rows")
+    for name in ("covariance", "covariances"):
+        P = getattr(estimate, name)
+        assert_covariance(P, P.shape, f"{name} after an update with two wrong rows")

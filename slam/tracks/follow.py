@@ -168,30 +168,31 @@ def best_pairs(rows, columns, distance, allowed, count, size, d_match, ratio, go
 
 @kernel
 def mutual_best(products, allowed, signs, feature_signs, d_match, ratio):
-    """The features (N,) that belong to tracks by `best_pairs`, −1 for none, wherever they lie.
+    """The features (N,) that belong to tracks as in `best_pairs`, −1 for none, wherever they lie.
 
     Given are the inner products of descriptors, tracks by features (N, M), which pairs are `allowed` (N, M; all where
     that is empty), and both signs of the Laplacian.
     """
-    limit = d_match / ratio  # farther features affect neither best nor ratio
-    least = np.float32(1.0) - np.float32(0.5) * limit * limit
-    best, count, room = np.full(len(products), -1, np.intp), 0, 4 * len(products) + 64
-    rows, columns, distance = np.empty(room, np.intp), np.empty(room, np.intp), np.empty(room, np.float32)
-    for n in range(products.shape[0]):
+    count, far = len(products), np.float32(-np.inf)
+    best, distance = np.full(count, -1, np.intp), np.empty(count, np.float32)
+    of_column = np.full(products.shape[1], np.inf, np.float32)
+    for n in range(count):
+        first = second = far
         for m in range(products.shape[1]):
-            if products[n, m] <= least or signs[n] != feature_signs[m] or (allowed.size > 0 and not allowed[n, m]):
-                continue
-            if count == room:
-                room *= 2
-                rows, columns, distance = grown(rows, room), grown(columns, room), grown(distance, room)
-            d = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * products[n, m], np.float32(0.0)))
-            rows[count], columns[count], distance[count] = n, m, d
-            count += 1
-    every, good = np.ones(count, np.bool_), np.empty(count, np.bool_)
-    best_pairs(rows, columns, distance, every, count, products.shape, d_match, ratio, good)
-    for p in range(count):
-        if good[p] and best[rows[p]] < 0:
-            best[rows[p]] = columns[p]
+            p = products[n, m]
+            if p > second and signs[n] == feature_signs[m] and (allowed.size == 0 or allowed[n, m]):
+                second = min(p, first)
+                if p > first:
+                    first, best[n] = p, m
+        distance[n] = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * first, np.float32(0.0)))
+        other = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * second, np.float32(0.0)))
+        if not (distance[n] < d_match and distance[n] < ratio * other):
+            best[n] = -1
+        elif distance[n] < of_column[best[n]]:  # a row that would not take it has no claim to a column
+            of_column[best[n]] = distance[n]
+    for n in range(count):
+        if best[n] >= 0 and distance[n] > of_column[best[n]]:
+            best[n] = -1
     return best
 
 

@@ -13,8 +13,7 @@ from backends.iekf import IekfBackend
 from slam.data import Observations, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
-from slam.models import EstimatorModels, MotionModel, models_for
-from slam.testing.hostile import play
+from slam.models import EstimatorModels, MotionModel, SlideModel, models_for
 from tests.backends.ekf_runs import (
     FORWARD,
     MODELS,
@@ -27,6 +26,7 @@ from tests.backends.ekf_runs import (
     predicted,
     turning_drive,
 )
+from tests.backends.hostile_calls import play
 from tests.backends.scenes import RIG, Scene, cloud, observe, path, run, scene, step
 
 # --- gaps and turns ---
@@ -141,7 +141,7 @@ def test_an_update_that_ends_a_great_uncertainty_keeps_all_its_digits(landmarks)
 def test_a_pair_that_is_not_in_step_moves_nothing(make):
     """The first right images were taken at other times, at 10 m/s: their landmarks contradict all that follows."""
     poses, rng = path(10, 0.1, 6.7 * FORWARD, STILL), np.random.default_rng(1)
-    models = replace(models_for("driving"), pixel_sigma=0.5)
+    models = replace(models_for("driving"), pixel_sigma=0.5, slide=SlideModel())
     points = cloud(poses, 150, rng, 10.0, 50.0)
     backend, known = make(RIG, models), set()
     late = se3.pose(np.eye(3), [0, 0, 0.5])
@@ -190,7 +190,7 @@ def test_wrong_matches_are_found(make, drive, share):
 
 def test_a_landmark_in_contradiction_with_the_others_is_found(drive):
     """An innovation within its own wide gate, but not where the others say: the velocity is unknown at first."""
-    models = replace(models_for("driving"), pixel_sigma=0.5)
+    models = replace(models_for("driving"), pixel_sigma=0.5, slide=SlideModel())
     backend, seen = predicted(drive, 1, models=models)
     uv_left, uv_right = seen.uv_left.copy(), seen.uv_right.copy()
     uv_left[5] += [8.0, -6.0]
@@ -262,3 +262,22 @@ def test_no_pixel_of_a_camera(drive, pixel):
     uv[3, 0] = 0.9e5  # no camera has it, but a number that can be worked with
     report = backend.update(Observations(seen.ids, uv, seen.uv_right))
     np.testing.assert_array_equal(report.rejected, seen.ids[[3]])
+
+
+@pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])
+@pytest.mark.parametrize("degrees", [80, 88, 180])
+def test_a_roll_in_one_step(make, degrees):
+    """Beyond what the motion model expects, to where Euler angles are singular: all landmarks count in the end."""
+    poses, found = path(10, 0.1, np.array([0, 0, 0.5]), STILL), []
+    for seed in range(5):
+        rng, known, backend = np.random.default_rng(seed), set(), make(RIG, MODELS)
+        points = cloud(poses, 60, rng)
+        for k, T in enumerate(poses):
+            step(backend, 0.1 * k, observe(T, points, 0.5, rng), known)
+        rolled = poses[-1] @ se3.exp(np.array([0, 0, np.radians(degrees), 0, 0, 0.05]))
+        seen = observe(rolled, points, 0.5, rng, 60)
+        backend.predict(1.9)
+        report = backend.update(seen.select(np.isin(seen.ids, list(known))), rolled)
+        assert report.status is UpdateStatus.OK and len(report.rejected) <= 1
+        found.append(nees(backend, rolled))
+    assert max(found) < chi2.ppf(0.9999, 6)

@@ -18,7 +18,6 @@ from slam.atlas.map_io import load_map
 from slam.config import SystemConfig
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import SequenceError, SlamError
-from slam.files import lock_folder
 from slam.geometry.trajectory import Trajectory
 from slam.run.options import RunOptions
 from slam.run.outputs import FRAME_COLUMNS
@@ -76,23 +75,14 @@ def write_run(rng: np.random.Generator, folder: Path) -> None:
     sequence: Sequence = Scripted(error, int(rng.integers(FRAMES + 1)))  # type: ignore[assignment]
     backend = choose(rng, ("ekf", "smoother"))
     options = RunOptions(backend, "none", SystemConfig(), out, record=record, save_map=known)
-    lock = None
-    if rng.random() < 0.1 and (out.is_dir() or _kind(out) is None):
-        out.mkdir(exist_ok=True)
-        lock = lock_folder(out)
     raised: BaseException | None = None
     try:
         with disk_of(size):
             run(sequence, options, frontend=Features())  # type: ignore[arg-type]
     except (SlamError, Interrupted) as caught:
         raised = caught
-    finally:
-        if lock is not None:
-            os.close(lock)
     if isinstance(raised, SlamError):
         require_line(raised)
-    if lock is not None and not isinstance(raised, SlamError):
-        raise Broken("two runs write to one folder")
     if raised is None and size is not None and not (out / "summary.json").exists():
         raise Broken("a run without a summary ends well")
     for path, kind in before.items():

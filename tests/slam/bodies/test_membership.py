@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from slam.bodies import membership
-from slam.bodies.bodies import Body, continued, new_body, with_extent
+from slam.bodies.bodies import PROOF, Body, continued, new_body, with_evidence, with_extent
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.fits import fit_positions
 from slam.bodies.membership import merge
@@ -68,7 +68,7 @@ def seen_from(poses: Array, local: Array, seed: int) -> Array:
 def body_along(poses: Array, members: Array, tracks: Tracks, id: int = 1) -> Body:
     """A settled body with these poses whose members are these rows."""
     body = new_body(id, poses[SLOT, :3, 3], np.zeros(6), TIMES, 0.0, 0.0)
-    body = replace(body, T=poses[SLOT], history=poses, seen=50, proven=True)
+    body = replace(body, T=poses[SLOT], history=poses, seen=50, certain=PROOF)
     membership.add_members(body, tracks, members, sure=True)
     return with_extent(body, tracks.local[members])
 
@@ -94,14 +94,27 @@ def test_a_part_that_turns_otherwise_leaves_and_comes_back_only_on_proof() -> No
     seen = np.concatenate([seen_from(poses, local[:12], 2), seen_from(path(LID), local[12:], 3)])
     tracks = table(seen)
     body = body_along(poses, np.arange(16), tracks)
-    gains = membership.update_members({1: body}, FRAME, tracks)
+    gains, against = membership.update_members({1: body}, FRAME, tracks)[1]
     lid = np.arange(12, 16)
     assert (tracks.body[:12] == 1).all()
     assert (tracks.body[lid] == -1).all() and tracks.expelled[lid].all()
-    assert len(gains[1]) == 12
+    assert len(gains) == 12 and against == 0
     enter(tracks, lid, SLOT, seen[lid, SLOT])
     membership.update_members({1: body}, FRAME, tracks)
     assert (tracks.body[lid] == -1).all()
+
+
+@pytest.mark.parametrize(("inside", "solid"), [(0, True), (6, True), (12, False)])
+def test_what_encloses_points_that_stand_still_is_no_body(inside: int, solid: bool) -> None:
+    """The shadow of somebody who walks, for instance: the ground shows within it."""
+    poses = path(MOVING)
+    ground = 0.6 * corners(12, 4) + poses[SLOT, :3, 3]
+    ground[inside:, 0] += 0.5  # the others lie beside the body
+    tracks = table(np.concatenate([seen_from(poses, corners(16, 1), 2), seen_from(STILL, ground, 3)]))
+    body = body_along(poses, np.arange(16), tracks)
+    gains, against = membership.update_members({1: body}, FRAME, tracks)[1]
+    assert against == inside
+    assert with_evidence(body, 0.0, int((gains > membership.CLEAR).sum()), against).proven == solid
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ def test_a_pair_without_noise_gives_the_truth():
     ideal = np.column_stack([rng.uniform(-500, 500, 300), rng.uniform(-150, 150, 300), rng.uniform(0, 40, 300)])
     pair = [ideal, move(ideal, R, t, F)[0]]
     measured = [x - MODEL.field(x)[:, :3] @ theta for x in pair]
-    corrected = [x + MODEL.shift(x, theta) for x in measured]
+    corrected = [x + MODEL.shift(x, theta)[:, :3] for x in measured]
     evidence = pair_evidence(MODEL, Pair(*corrected, R, t), theta, NOISE)
     strong = 1e8
     mean = np.linalg.solve(prior_information(MODEL) + strong * evidence.S, strong * evidence.e)

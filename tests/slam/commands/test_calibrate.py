@@ -5,28 +5,18 @@ import re
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import slam
 from slam.calibration import RigModel, RigPosterior
 from slam.calibration.corrected import corrected_rig
-from slam.commands.cli import app
 from slam.errors import SlamError
 from slam.run import calibrating
 from slam.run.calibrating import _judged
 from slam.run.options import load
+from tests.scripts import command
 
 WORLD = "synthetic:aisle?frames=6&speed=16&turn_error=1"
 QUIET = ("-q", "--no-picture")
-
-
-def command(*words):
-    """The command in this process; an error of its own is raised."""
-    done = CliRunner().invoke(app, [*map(str, words)])
-    if isinstance(done.exception, SlamError):
-        raise done.exception
-    assert done.exit_code == 0, (done.output, done.exception)
-    return done.output
 
 
 @pytest.fixture(scope="module")

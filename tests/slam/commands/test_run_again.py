@@ -4,23 +4,13 @@ import json
 import shutil
 
 import pytest
-from typer.testing import CliRunner
 
-from slam.commands.cli import app
 from slam.errors import SlamError
 from slam.run.options import load
+from tests.scripts import command
 
 WORLD = "synthetic:aisle?frames=6&width=160&height=120"
 SAME = ("trajectory.txt", "trajectory_final.txt", "landmarks.csv", "objects.csv", "truth.txt", "schema.json")
-
-
-def slam(*words):
-    """The command in this process; an error of its own is raised."""
-    done = CliRunner().invoke(app, [*map(str, words)])
-    if isinstance(done.exception, SlamError):
-        raise done.exception
-    assert done.exit_code == 0, (done.output, done.exception)
-    return done.output
 
 
 @pytest.fixture
@@ -33,12 +23,12 @@ def here(tmp_path, monkeypatch):
 def recording(tmp_path_factory):
     """A tiny recording on disk."""
     folder = tmp_path_factory.mktemp("recordings")
-    slam("render", WORLD, "--out", folder / "rendered", "-q")
+    command("render", WORLD, "--out", folder / "rendered", "-q")
     return folder / "rendered"
 
 
 def run(*words):
-    slam("run", *words, "-q", "--no-picture")
+    command("run", *words, "-q", "--no-picture")
 
 
 @pytest.mark.slow
@@ -71,7 +61,7 @@ def test_a_recording_is_found_again_or_given_anew(here, recording):
     assert (found.source, found.kind) == (f"{here / 'data'}?kind=driving", "driving")
     (here / "data").rename(here / "elsewhere")
     with pytest.raises(SlamError, match=r"data\?kind=driving is no longer there: give its new place"):
-        slam("run", "--config", "out")
+        command("run", "--config", "out")
     run("elsewhere", "--config", "out", "--out", "third")
     assert load(here / "third")[0].config == found.config
 
@@ -108,9 +98,9 @@ def test_a_bad_config_is_one_line(tmp_path, text, words):
     if text is not None:
         (tmp_path / "config.json").write_text(text)
     with pytest.raises(SlamError, match=words):
-        slam("run", WORLD, "--config", tmp_path, "--kind", "driving")
+        command("run", WORLD, "--config", tmp_path, "--kind", "driving")
     with pytest.raises(SlamError, match="name a sequence"):
-        slam("run")
+        command("run")
 
 
 def test_another_run_is_not_overwritten_without_being_told(here):

@@ -15,8 +15,8 @@ from slam.data import FrameStatus, StereoFeatures
 from slam.errors import MeasurementError
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
-from slam.testing.hostile import assert_sound
 from slam.tracks.config import MapConfig
+from tests.backends.hostile_calls import assert_sound
 from tests.slam.scene import RIG, Cloud, path
 
 BACKENDS = ("ekf", "smoother", "window")

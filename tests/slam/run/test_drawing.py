@@ -6,8 +6,7 @@ import pytest
 import slam
 from slam.config import SystemConfig
 from slam.errors import SlamError
-from slam.run.drawing import _IN_MAP, _LEGEND, FramePictures, _bgr
-from slam.run.schema import body_colour
+from slam.run.drawing import _IN_MAP, _LEGEND, FramePictures
 from tests.fuzz.runs import disk_of
 
 
@@ -28,11 +27,6 @@ def test_places_that_cannot_be_written_are_said(steps, tmp_path):
     system, ((frame, result), _) = steps
     with pytest.raises(SlamError, match=r"folder\.mp4: cannot be written"), FramePictures(tmp_path / "folder.mp4") as p:
         p.show(frame, result, system)
-
-
-def test_a_body_has_one_colour_in_images_and_maps():
-    """It was orange in the video and violet in the picture of the run."""
-    assert _bgr(2) == body_colour(2)[::-1] and len({body_colour(body) for body in range(1, 6)}) == 5
 
 
 def test_the_map_beside_a_frame_says_what_its_marks_are(steps, tmp_path):

@@ -16,7 +16,6 @@ from slam.errors import SlamError
 from slam.files import RowFile, whole_file
 from slam.run import runner
 from slam.run.options import RunOptions
-from slam.run.outputs import RunFiles
 from slam.run.recording import load_recording
 from tests.fuzz.runs import Features, Scripted, disk_of
 
@@ -51,14 +50,6 @@ def test_rows_are_whole_on_a_full_disk(tmp_path):
     file.write("third\n")
     file.close()
     assert (tmp_path / "rows").read_text() == "first\nthird\n"
-
-
-def test_two_runs_do_not_share_a_folder(tmp_path):
-    with RunFiles(tmp_path / "out"), pytest.raises(SlamError, match="another run is writing to this folder"):
-        RunFiles(tmp_path / "out")
-    with RunFiles(tmp_path / "out"):
-        pass
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"trajectory.txt", "frames.csv", "objects.csv"}
 
 
 def test_a_disk_that_fills_up_half_way(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,24 +11,13 @@ import pytest
 from tests import recordings
 
 
-@pytest.fixture
-def euroc(tmp_path: Path) -> Path:
-    return recordings.write_euroc(tmp_path / "V0_01")
+def _written(name: str, folder: str) -> Callable[[Path], Path]:
+    """A fixture: a sequence that `recordings` writes."""
+    return pytest.fixture(name=name)(lambda tmp_path: getattr(recordings, f"write_{name}")(tmp_path / folder))
 
 
-@pytest.fixture
-def kitti(tmp_path: Path) -> Path:
-    return recordings.write_kitti(tmp_path / "dataset")
-
-
-@pytest.fixture
-def raw(tmp_path: Path) -> Path:
-    return recordings.write_raw(tmp_path / "2011_09_26")
-
-
-@pytest.fixture
-def two_folders(tmp_path: Path) -> Path:
-    return recordings.write_two_folders(tmp_path / "mine")
+euroc, kitti = _written("euroc", "V0_01"), _written("kitti", "dataset")
+raw, two_folders = _written("raw", "2011_09_26"), _written("two_folders", "mine")
 
 
 @pytest.fixture

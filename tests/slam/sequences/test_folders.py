@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,6 +19,7 @@ from slam.input.features import outside_masks
 from slam.sequences import open_sequence, with_mask
 from slam.sequences.base import said_before
 from slam.sequences.names import keys_of, of_sides
+from tests import recordings
 from tests.recordings import FIVE, rename, seeds
 
 PAIRS = [(i, i + 10) for i in range(6)]
@@ -371,11 +373,7 @@ def test_features_under_a_mask_are_not_used(tmp_path: Path, two_folders: Path) -
 # ------------------------------------------------------------------------------------------------ videos
 
 
-def write_video(path: Path, images: list[np.ndarray], codec: str = "FFV1", rate: float = 25) -> None:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), rate, images[0].shape[::-1])
-    for image in images:
-        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
+write_video = partial(recordings.write_video, codec="FFV1", rate=25)
 
 
 def grey(first: int, count: int = 12, size: tuple[int, int] = (64, 48)) -> list[np.ndarray]:
@@ -412,7 +410,7 @@ def test_two_videos(videos: Path) -> None:
 
 def test_a_video_that_ends_too_early(videos: Path, build: SimpleNamespace) -> None:
     noise = [np.random.default_rng(i).integers(0, 255, (48, 64)).astype(np.uint8) for i in range(12)]
-    write_video(videos / "left.avi", noise, "MJPG")  # so that the frames are most of the file
+    write_video(videos / "left.avi", noise, codec="MJPG")  # so that the frames are most of the file
     build.cut(videos / "left.avi", 0.7)
     sequence = open_sequence(videos)
     frames = list(sequence)

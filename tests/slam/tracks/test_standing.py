@@ -127,7 +127,10 @@ def test_what_fills_the_view_of_a_standing_vehicle_does_not_take_it_along(backen
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])
 def test_people_who_walk_by_hardly_move_the_camera(slam_data, backend):
-    """The limits lie half above what is reached: 6.8 mm and 0.16° (`ekf`), 4.5 mm and 0.10° (`smoother`)."""
+    """The limits lie half above what is reached: 6.8 mm and 0.16° (`ekf`), 4.5 mm and 0.10° (`smoother`).
+
+    Two people are in view at most; their shadows, through which the ground is seen, are no bodies.
+    """
     folder = slam_data / "still_camera_people"
     sequence = slam.open_sequence(f"{folder}?calibration=calib.txt&fps=30")
     system = slam.StereoSlam(sequence.rig, backend=backend, kind=sequence.kind)
@@ -135,4 +138,5 @@ def test_people_who_walk_by_hardly_move_the_camera(slam_data, backend):
     assert {result.status.value for result in results} == {"started", "tracked"}
     poses = np.array([result.estimate.T_world_left for result in results])
     assert np.linalg.norm(poses[:, :3, 3], axis=1).max() < 10e-3
+    assert max(len(result.objects) for result in results) <= 3
     assert np.degrees(np.arccos((np.trace(poses[:, :3, :3], axis1=1, axis2=2).min() - 1) / 2)) < 0.25

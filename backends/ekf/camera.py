@@ -1,0 +1,105 @@
+"""What a filter asks of its camera, and what all cameras share: the prior, and the noise of a motion.
+
+An error is what is true less what is believed: adding it corrects. The camera's (12,) is of its pose (6), velocity (3)
+and rate (3), in numbers that each camera chooses. `Camera.world` says which displacement of the world an error of the
+pose is, ``gauge`` of `backends.ekf.landmarks` how that changes a landmark's coordinates; their product is how far an
+error of the pose moves the landmarks with it.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol, Self
+
+import numpy as np
+
+from backends.ekf.covariance import POSE
+from slam.geometry.se3 import Array
+from slam.models import ANYWHERE, EstimatorModels
+
+_ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an attitude [rad]
+
+#: Of a camera's error (12,), which stands from now on: its velocity is zero for certain.
+AT_REST = np.diag(np.repeat([1.0, 0.0], POSE))
+
+
+class Camera(Protocol):
+    """A camera's pose and velocities, and what an error of them means."""
+
+    @property
+    def pose(self) -> Array:
+        """``T_world_left`` (4, 4)."""
+
+    @property
+    def transports(self) -> bool:
+        """Whether the covariance is transported to a corrected state; see `FilterState.corrected`."""
+
+    def by_error(self) -> Array:
+        """Derivative (6, 6) of the pose's right perturbation [rotation, translation] by the pose's error."""
+
+    def world(self) -> Array:
+        """The displacement (6, 6) of the world [shift, turn about its origin] that is an error of the pose."""
+
+    def moved(self, error: Array) -> Self:
+        """After an error (12,) is corrected."""
+
+    def minus(self, other: Self) -> Array:
+        """The error (12,) that would bring the other camera here."""
+
+    def at(self, T: Array) -> Self:
+        """At another pose (4, 4), with the same velocities."""
+
+    def facing(self, T: Array) -> tuple[Self, Array]:
+        """The same camera, with an error that is regular from here to a pose T; its derivative (12, 12) by this one's.
+
+        The camera itself where its error is regular there as it is.
+        """
+
+    def transport(self, to: Self) -> Array:
+        """An error as one of another camera (12, 12): the same displacement of the world, ``W(to) J = W``.
+
+        If the camera does not transport, the same numbers.
+        """
+
+    def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion:
+        """After `dt` [s] of constant velocity, with the error's covariance P (12, 12)."""
+
+    def at_rest(self) -> Motion:
+        """After a step of a camera that stands: the pose stays, and the velocity is zero for certain."""
+
+
+#: A camera that has moved; its error is a matrix (12, 12) times what it was, plus noise of a covariance (12, 12).
+Motion = tuple[Camera, Array, Array]
+
+
+def prior(models: EstimatorModels) -> Array:
+    """The first camera's covariance (12, 12) of position, attitude, velocity, and body rate."""
+    sigmas = (
+        models.initial_position_sigma, models.initial_rotation_sigma,
+        models.initial_velocity_sigma, models.initial_angular_velocity_sigma,
+    )  # fmt: skip
+    return np.diag(np.repeat(np.array(sigmas) ** 2, 3))
+
+
+def motion_noise(models: EstimatorModels, dt: float, W: Array | None = None) -> Array:
+    """``W Q Wᵀ`` (12, 12) of the impulses of a step of `dt` [s], with the printed W (12, 6) or another."""
+    W = np.concatenate([dt * np.eye(POSE), np.eye(POSE)]) if W is None else W
+    return np.asarray(W * np.repeat(models.motion.velocity_variance(dt), 3) @ W.T)
+
+
+def after_gap(models: EstimatorModels, P: Array, dt: float) -> Array | None:
+    """Covariance (12, 12) of a camera that may have turned anyhow in the last `dt` [s]; None where it may not.
+
+    P (12, 12) is that before, of position, attitude, velocity, and rate; of the Euler angles and their rates in the
+    papers' camera. What is returned is of a turn about the body's axes and of the body's rate. The position is as
+    uncertain as the prior of the speed makes it meanwhile. Larger numbers would mean nothing, and leave a double too
+    few digits for the map.
+    """
+    attitude, rate = np.arange(3, 6), np.arange(9, 12)
+    variance = P[attitude, attitude] + 2 * dt * P[attitude, rate] + dt * dt * P[rate, rate]
+    if variance.max() + dt * dt * models.motion.velocity_variance(dt)[1] <= _ANY_ATTITUDE**2:
+        return None
+    after = prior(models)
+    after[:3, :3] = P[:3, :3] + (models.initial_velocity_sigma * dt) ** 2 * np.eye(3)
+    after[:3, :3] *= min(1.0, ANYWHERE**2 / after[:3, :3].diagonal().max())
+    after[3:6, 3:6] = np.pi**2 / 3 * np.eye(3)
+    return after
