@@ -197,7 +197,8 @@ class SmootherBackend:
         s = self.state
         if s.started:
             before, s = s, rebuilt(corrected(s, correct), self._steps, self._graph)
-            if not self.revises_path:  # what the landmarks move by is none of their error: the last of the rig's
+            # what the landmarks move by is none of their error: it is the last of the rig's (`RevisingBackend.revise`)
+            if not self.revises_path:
                 by_rig = s.landmarks.by_rig.copy()
                 by_rig[:, :, -1:] -= (s.landmarks.position - before.landmarks.position)[:, :, None]
                 s = replace(s, landmarks=replace(s.landmarks, by_rig=by_rig))

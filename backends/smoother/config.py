@@ -31,6 +31,5 @@ class SmootherConfig:
     past: int = 50
 
     def __post_init__(self) -> None:
-        ranges = {"track": (2, 10**6), "lag": (2, 10**6), "past": (0, 10**6)}
-        ranges["landmarks"] = (0, 10**6)
+        ranges = {"track": (2, 10**6), "lag": (2, 10**6), "landmarks": (0, 10**6), "past": (0, 10**6)}
         require_not_negative(self, ranges, "smoother")

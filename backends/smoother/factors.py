@@ -71,8 +71,8 @@ class FactorMaker:
 
         gtsam linearises it where it linearises the rest: at other poses it would pull at the path as a whole, which
         nothing else holds. `keys` are three successive poses with the times `dt` (2,) [s] between them; or two of which
-        the first velocity is unknown, and then the first time does
-        not count. `over` is the time [s] over which the velocity changed; None for the last one of these.
+        the first velocity is unknown, and then the first time does not count. `over` is the time [s] over which the
+        velocity changed; None for the last one of these.
         """
         n, before, last = len(keys), float(dt[0]), float(dt[1])
 

@@ -88,6 +88,7 @@ class SmootherState:
     frame: int = -1  # number of the newest frame
     since: int = 0  # frames since the problem has begun, 0 for its first one
     inside: bool = True  # whether the newest frame is the newest pose of the graph
+    follows_pose: bool = False  # whether the frame before it is a pose of the graph
     landmarks: SmootherLandmarks = field(default_factory=SmootherLandmarks.none)
     serials: int = 0  # number of landmarks so far
     known: Mapping[int, Known] = field(default_factory=dict)  # by serial number

@@ -62,6 +62,7 @@ class Steps(RectifiedMeasurement):
             pair=np.block([[s.own, cross.T], [cross, own]]),
             shared=np.concatenate([s.shared[:, 6:], s.shared @ J.T], axis=1),
             by_rig=np.concatenate([s.by_rig[6:], J @ s.by_rig]), since=s.since + 1, inside=False, measured=False,
+            follows_pose=s.inside,
             tie=_tie(s, inverse(s.poses[-1]) @ T, own, s.shared @ J.T, dt, first, rests),
         )  # fmt: skip
 
@@ -135,7 +136,7 @@ class Steps(RectifiedMeasurement):
         marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T, linear)
         marks = marks.measured(seen, z[used], number, self.track, graph.oldest(s, number), graph.newest)
         sight = Sight.of(marks, seen, z[used])
-        if s.inside:
+        if s.inside:  # the very first frame, in a map that is known
             after = replace(
                 s, sights=(*s.sights[:-1], sight), poses=np.concatenate([s.poses[:-1], found.T[None]]),
                 last=np.stack([s.last[0], found.T]), landmarks=marks, by_rig=np.concatenate([s.by_rig[:6], by_rig]),
@@ -156,7 +157,7 @@ class Steps(RectifiedMeasurement):
         shared: Array = np.zeros((6, 12))
         if s.since:
             newest_first = np.roll(s.pair, 6, (0, 1))
-            if len(P) == 12 and not s.pair[:6, :6].any():  # the frame before is a pose of the graph
+            if len(P) == 12 and s.follows_pose:
                 newest_first, last[0] = np.roll(P, 6, (0, 1)), poses[-2]
             else:
                 last[0] = poses[-1] @ inverse(s.last[1]) @ s.last[0]
