@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg.blas import dtrmm
-from scipy.linalg.lapack import dpotrf, dtrtri
+from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs
 
 from backends.ekf.camera import Camera
 from backends.ekf.covariance import CAMERA, POSE, Covariance, numbers_of
@@ -66,6 +66,31 @@ class Update:
         """Where the coordinates (3M,) of the measured landmarks stand among those of the state's."""
         return numbers_of(self.rows - self.covariance.left)
 
+    @cached_property
+    def lever(self) -> Array:
+        """That (M, 3, 6) of the prior, see the module."""
+        return self.landmarks.gauge @ self.camera.world()
+
+    @cached_property
+    def gauge(self) -> tuple[Array, Array] | None:
+        """How uncertain the place of camera and landmarks in the world is, where all else is known.
+
+        A displacement N of both is one of the pose with the landmarks along by its lever. Its covariance is
+        ``(Nᵀ P⁻¹ N)⁻¹`` (6, 6), with P that of pose and measured landmarks; what of the state (n, 6) goes along is
+        ``P_n P⁻¹ N``. None where P has lost its digits.
+        """
+        P, b, h, each = self.covariance, 3 * self.covariance.left, len(self.covariance.head), self.numbers
+        pose = np.concatenate([P.camera[:POSE], P.head[:POSE, h + b :]], axis=1)
+        marks = np.concatenate([P.head[:CAMERA, h + b + each].T, P.marks[b + each, b:]], axis=1)
+        rows = np.concatenate([pose, marks])
+        N = np.concatenate([np.eye(POSE), self.lever.reshape(-1, POSE)])
+        root, info = dpotrf(np.concatenate([rows[:, :POSE], rows[:, CAMERA + each]], axis=1), lower=1)
+        if info != 0:
+            return None
+        along = dtrtrs(root, N, lower=1)[0]
+        own = np.linalg.inv(along.T @ along)
+        return own, rows.T @ dtrtrs(root, along, lower=1, trans=1)[0]
+
     def among_measured(self, change: Array) -> Array:
         """The part (6 + 3M,) of a change of the state (n,) that the measurements depend on."""
         return np.concatenate([change[:POSE], change[CAMERA + self.numbers]])
@@ -87,7 +112,7 @@ class Update:
         R, r = there.pose[:3, :3], there.pose[:3, 3]
         z, by_point = self.measure.stereo.project((marks.points - r) @ R)
         own = by_point @ (R.T @ self.coordinates.jacobian(marks.anchors, marks.c))
-        lever = marks.gauge @ (there.world() @ J[:POSE, :POSE])
+        lever = self.lever if camera is None is moved else marks.gauge @ (there.world() @ J[:POSE, :POSE])
         return Linearisation(self, there, J, change, z, own, lever, from_prior)
 
     def at_guess(self) -> Linearisation:
@@ -131,13 +156,21 @@ class Linearisation:
         update, P = self.update, self.update.covariance
         numbers, b, h = 3 * P.left + update.numbers, 3 * P.left, len(P.head)
         own = self.own if components.all() else np.where(components[:, :, None], self.own, 0.0)
-        by_pose, moved = -(own @ self.lever).reshape(-1, POSE), self.change[CAMERA + update.numbers]
+        turned = (own @ (update.lever - self.lever)).reshape(-1, POSE) * update.camera.transports
+        lever = update.lever if turned.any() and update.gauge is None else self.lever
+        by_pose, moved = -(own @ lever).reshape(-1, POSE), self.change[CAMERA + update.numbers]
         nu = np.where(components, update.z - self.z, 0.0).reshape(-1)
         nu += (own @ moved.reshape(-1, 3, 1)).reshape(-1) + by_pose @ self.change[:POSE]
         with_camera = _times(own, by_pose, P.camera[:POSE], P.head[:CAMERA, h + numbers].T)
         with_marks = _times(own, by_pose, P.head[:POSE, h + b :], P.marks[:, b:][numbers])
         S = _times(own, by_pose, with_camera[:, :POSE].T, with_marks[:, update.numbers].T)
         S[np.diag_indices(len(S))] += update.sigma**2
+        if turned.any() and update.gauge is not None:
+            own_gauge, along = update.gauge
+            of_gauge = turned @ own_gauge
+            S -= of_gauge @ turned.T
+            with_camera -= of_gauge @ along[:CAMERA].T
+            with_marks -= of_gauge @ along[CAMERA:].T
         return Innovation(self, components, own, by_pose, (with_camera, with_marks), nu, S)
 
 

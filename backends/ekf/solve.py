@@ -58,8 +58,7 @@ class Posterior:
         at, update = innovation.at, innovation.at.update
         if not (update.camera.transports and at.change.any()):
             return self.whitened
-        lever = update.landmarks.gauge @ update.camera.world()
-        return replace(at, lever=lever).innovation(innovation.components).whitened(self.used)
+        return replace(at, lever=update.lever).innovation(innovation.components).whitened(self.used)
 
 
 @dataclass(frozen=True, eq=False)
