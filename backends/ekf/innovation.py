@@ -73,11 +73,11 @@ class Update:
 
     @cached_property
     def gauge(self) -> tuple[Array, Array] | None:
-        """How uncertain the place of camera and landmarks in the world is, where all else is known.
+        """How uncertain (6, 6) the place of camera and landmarks in the world is, and what of the state (n, 6) moves.
 
-        A displacement N of both is one of the pose with the landmarks along by its lever. Its covariance is
-        ``(Nᵀ P⁻¹ N)⁻¹`` (6, 6), with P that of pose and measured landmarks; what of the state (n, 6) goes along is
-        ``P_n P⁻¹ N``. None where P has lost its digits.
+        A displacement N of the world is one of the pose with the landmarks along by the lever. With P that of pose and
+        measured landmarks its covariance is ``Σ = (Nᵀ P⁻¹ N)⁻¹``, and ``P_n P⁻¹ N`` of the state moves. None where P
+        has lost its digits.
         """
         P, b, h, each = self.covariance, 3 * self.covariance.left, len(self.covariance.head), self.numbers
         pose = np.concatenate([P.camera[:POSE], P.head[:POSE, h + b :]], axis=1)
@@ -101,7 +101,7 @@ class Update:
         A landmark is at ``h = Rᵀ (Y − r)`` (paper B, Eqs. 3-5).
         """
         there, marks = camera or self.camera, self.landmarks
-        J = self.camera.transport(there)
+        J = np.eye(CAMERA) if camera is None else self.camera.transport(camera)
         change = np.zeros(CAMERA + len(self.covariance.marks) - 3 * self.covariance.left)
         if camera is not None:
             change[:CAMERA] = np.linalg.solve(J, there.minus(self.camera))
@@ -152,12 +152,17 @@ class Linearisation:
         return np.asarray(np.isfinite(self.update.z) & np.isfinite(self.z).all(axis=1, keepdims=True))
 
     def innovation(self, components: BoolArray) -> Innovation:
-        """ν and S of some components (M, 3)."""
+        """ν and S of some components (M, 3).
+
+        If the camera transports its error, the prior has a displacement of the world as N, its derivative at the prior.
+        Elsewhere that is not quite one: ``H N = B`` is not zero, and the mean would move along it. So the place in the
+        world counts as known here, with ``P − N Σ Nᵀ``; where Σ is not at hand, the lever is the prior's.
+        """
         update, P = self.update, self.update.covariance
         numbers, b, h = 3 * P.left + update.numbers, 3 * P.left, len(P.head)
         own = self.own if components.all() else np.where(components[:, :, None], self.own, 0.0)
-        turned = (own @ (update.lever - self.lever)).reshape(-1, POSE) * update.camera.transports
-        lever = update.lever if turned.any() and update.gauge is None else self.lever
+        B = (own @ (update.lever - self.lever)).reshape(-1, POSE) * update.camera.transports
+        lever = update.lever if B.any() and update.gauge is None else self.lever
         by_pose, moved = -(own @ lever).reshape(-1, POSE), self.change[CAMERA + update.numbers]
         nu = np.where(components, update.z - self.z, 0.0).reshape(-1)
         nu += (own @ moved.reshape(-1, 3, 1)).reshape(-1) + by_pose @ self.change[:POSE]
@@ -165,12 +170,11 @@ class Linearisation:
         with_marks = _times(own, by_pose, P.head[:POSE, h + b :], P.marks[:, b:][numbers])
         S = _times(own, by_pose, with_camera[:, :POSE].T, with_marks[:, update.numbers].T)
         S[np.diag_indices(len(S))] += update.sigma**2
-        if turned.any() and update.gauge is not None:
-            own_gauge, along = update.gauge
-            of_gauge = turned @ own_gauge
-            S -= of_gauge @ turned.T
-            with_camera -= of_gauge @ along[:CAMERA].T
-            with_marks -= of_gauge @ along[CAMERA:].T
+        if B.any() and update.gauge is not None:
+            sigma, along = update.gauge
+            S -= B @ sigma @ B.T
+            with_camera -= B @ sigma @ along[:CAMERA].T
+            with_marks -= B @ sigma @ along[CAMERA:].T
         return Innovation(self, components, own, by_pose, (with_camera, with_marks), nu, S)
 
 

@@ -51,8 +51,8 @@ class Posterior:
     def information(self) -> Whitened:
         """The innovation that the covariance follows from.
 
-        If the camera transports its error, its pose moves landmarks as it does at the prior. So H is zero along every
-        displacement of the world as the prior's covariance has it, while the mean goes on from where they are by now.
+        If the camera transports its error, its pose moves landmarks as it does at the prior: H is zero along every
+        displacement of the world as the prior's covariance has it.
         """
         innovation = self.whitened.innovation
         at, update = innovation.at, innovation.at.update
@@ -139,7 +139,8 @@ def _predicted(found: Posterior, gated: Gated) -> BoolArray:
     seen = at.seen()
     out = np.flatnonzero(~found.used & seen.any(axis=1) & np.isfinite(gated.distances))
     if len(out):
-        every, numbers = at.innovation(seen), numbers_of(out)
+        every = gated.innovation if at is gated.innovation.at else at.innovation(seen)
+        numbers = numbers_of(out)
         X = found.whitened.inverse @ every.S[:, numbers]
         nu = (every.nu[numbers] - found.whitened.w @ X).reshape(-1, 3)
         S = every.S[numbers[:, None], numbers] - X.T @ X
