@@ -64,7 +64,7 @@ class Update:
     @cached_property
     def numbers(self) -> IndexArray:
         """Where the coordinates (3M,) of the measured landmarks stand among those of the state's."""
-        return numbers_of(self.rows - self.covariance.left)
+        return numbers_of(self.rows - self.covariance.parked)
 
     @cached_property
     def lever(self) -> Array:
@@ -79,7 +79,7 @@ class Update:
         measured landmarks its covariance is ``Σ = (Nᵀ P⁻¹ N)⁻¹``, and ``P_n P⁻¹ N`` of the state moves. None where P
         has lost its digits.
         """
-        P, b, h, each = self.covariance, 3 * self.covariance.left, len(self.covariance.head), self.numbers
+        P, b, h, each = self.covariance, 3 * self.covariance.parked, len(self.covariance.head), self.numbers
         pose = np.concatenate([P.camera[:POSE], P.head[:POSE, h + b :]], axis=1)
         marks = np.concatenate([P.head[:CAMERA, h + b + each].T, P.marks[b + each, b:]], axis=1)
         rows = np.concatenate([pose, marks])
@@ -102,7 +102,7 @@ class Update:
         """
         there, marks = camera or self.camera, self.landmarks
         J = np.eye(CAMERA) if camera is None else self.camera.transport(camera)
-        change = np.zeros(CAMERA + len(self.covariance.marks) - 3 * self.covariance.left)
+        change = np.zeros(CAMERA + len(self.covariance.marks) - 3 * self.covariance.parked)
         if camera is not None:
             change[:CAMERA] = np.linalg.solve(J, there.minus(self.camera))
         if moved is not None:
@@ -159,7 +159,7 @@ class Linearisation:
         world counts as known here, with ``P − N Σ Nᵀ``; where Σ is not at hand, the lever is the prior's.
         """
         update, P = self.update, self.update.covariance
-        numbers, b, h = 3 * P.left + update.numbers, 3 * P.left, len(P.head)
+        numbers, b, h = 3 * P.parked + update.numbers, 3 * P.parked, len(P.head)
         own = self.own if components.all() else np.where(components[:, :, None], self.own, 0.0)
         B = (own @ (update.lever - self.lever)).reshape(-1, POSE) * update.camera.transports
         lever = update.lever if B.any() and update.gauge is None else self.lever
@@ -239,7 +239,7 @@ class Whitened:
         """``P Hᵀ L⁻ᵀ``, and L⁻¹ times derivatives of ν by errors of the rig; see `Covariance.corrected`."""
         nu, (with_camera, with_marks), update = self.innovation, self.innovation.HP, self.innovation.at.update
         P, H = update.covariance, (nu.own, nu.by_pose)
-        h, b, numbers = len(P.head), 3 * P.left, 3 * P.left + update.numbers
+        h, b, numbers = len(P.head), 3 * P.parked, 3 * P.parked + update.numbers
         poses_and_left = np.concatenate([P.head[CAMERA:, h + numbers].T, P.marks[:, :b][numbers]], axis=1)
         rest = _times(*H, P.head[:POSE, CAMERA : h + b], poses_and_left)
         V = dtrmm(1.0, self.inverse.T, np.concatenate([with_camera, rest], axis=1).T, side=1)
