@@ -1,8 +1,9 @@
 """The filter's covariance: of what is in the state, and of what has left it.
 
-A landmark that has left is parked: it is corrected no more, but its error's covariance with the state goes on: this is the filter of
-Schmidt, whose covariance is exact for what it does. With the gain of such a landmark zero, ``P_AA`` changes as ever,
-``P_Ab ← (1 − K H) P_Ab`` and ``P_bb`` not at all. When it is measured again it joins the state with its covariances.
+A landmark that has left is parked: it is corrected no more, but its error's covariance with the state goes on, as in
+the filter of Schmidt, whose covariance is exact for what it does. With the gain of such a landmark zero, ``P_AA``
+changes as ever, ``P_Ab ← (1 − K H) P_Ab`` and ``P_bb`` not at all. When it is measured again it joins the state with
+its covariances.
 The camera's last poses, as they were believed in their time, are kept in the same way (stochastic clones).
 What is known of a landmark from elsewhere is independent of all else until it is measured: nothing need be carried.
 

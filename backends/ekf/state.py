@@ -144,7 +144,7 @@ class FilterState:
             raise UnsolvableError("the corrected state is not finite")
         marks.seen[update.rows[found.used]] = self.frame
         J, shift = update.camera.transport(camera), self._shift(marks, camera)
-        covariance = update.covariance.corrected(*found.information.gain_root(), J, shift)
+        covariance = update.covariance.corrected(*found.whitened.gain_root(), J, shift)
         if not (covariance.marks.diagonal() > 0).all():
             raise UnsolvableError("a landmark's variance would not stay positive")
         return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()
