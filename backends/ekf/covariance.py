@@ -1,6 +1,6 @@
 """The filter's covariance: of what is in the state, and of what has left it.
 
-A landmark that has left is parked: it is corrected no more, but its error's covariance with the state goes on. This is
+A landmark that has left is parked: it is corrected no more, but its error's covariance with the state goes on, as in
 the filter of Schmidt, whose covariance is exact for what it does. With the gain of such a landmark zero, ``P_AA``
 changes as ever, ``P_Ab ← (1 − K H) P_Ab`` and ``P_bb`` not at all. When it is measured again it joins the state with
 its covariances.
@@ -80,15 +80,6 @@ class Covariance:
         out, there = np.zeros((len(rows), 3, self.by_rig.shape[1])), rows < self.correlated
         out[there] = self.by_rig[len(self.head) + numbers_of(rows[there])].reshape(-1, *out.shape[1:])
         return out
-
-    def displaced(self, rows: IndexArray, change: Array) -> Covariance:
-        """After a change (M, 3) of some landmarks' coordinates that is none of their error.
-
-        It is that of the last of the rig's errors, which is known to be 1 (`slam.interfaces.ConsideringBackend`).
-        """
-        by_rig, there = self.by_rig.copy(), rows < self.correlated
-        by_rig[len(self.head) + numbers_of(rows[there]), -1:] -= change[there].reshape(-1, 1)
-        return replace(self, by_rig=by_rig)
 
     def joint_poses(self, J: Array, n: int) -> Array:
         """Joint covariance (6n, 6n) of the last poses, the present one, J (6, 6) times [r, φ], last."""
@@ -201,11 +192,16 @@ class Covariance:
         head[:, h + b :] += head[:, :POSE] @ shift.T
         return replace(self, head=head, marks=marks, by_rig=by_rig)
 
-    def transported(self, shift: Array) -> Covariance:
-        """With a shift (A, 3, 6) as `corrected` adds it, and nothing measured."""
-        h, b = len(self.head), 3 * self.parked
+    def displaced(self, rows: IndexArray, change: Array, shift: Array) -> Covariance:
+        """After a change (M, 3) of some landmarks' coordinates that is none of their error, with a shift as above.
+
+        It is that of the last of the rig's errors, which is known to be 1 (`slam.interfaces.ConsideringBackend`).
+        """
+        by_rig, h, b = self.by_rig.copy(), len(self.head), 3 * self.parked
+        by_rig[h + numbers_of(rows), -1:] -= change.reshape(-1, 1)
         V = np.zeros((h, 1)), np.zeros((b, 1)), np.zeros((len(self.marks) - b, 1), order="F")
-        return self.corrected(V, np.zeros((1, self.by_rig.shape[1])), np.eye(CAMERA), shift)
+        nothing = np.zeros((1, by_rig.shape[1]))
+        return replace(self, by_rig=by_rig).corrected(V, nothing, np.eye(CAMERA), shift)
 
 
 def numbers_of(rows: IndexArray) -> IndexArray:

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg.blas import dtrmm
-from scipy.linalg.lapack import dpotrf
+from scipy.linalg.lapack import dpotrf, dpotrs
 
 from backends.ekf.camera import Camera
 from backends.ekf.covariance import CAMERA, POSE, Covariance, numbers_of
@@ -65,6 +65,25 @@ class Update:
         """Where the coordinates (3M,) of the measured landmarks stand among those of the state's."""
         return numbers_of(self.rows - self.covariance.parked)
 
+    @cached_property
+    def lever(self) -> Array:
+        """That (M, 3, 6) of the prior, see the module."""
+        return self.landmarks.gauge @ self.camera.world()
+
+    @cached_property
+    def place(self) -> Array | None:
+        """The part A (6, 6 + 3M) of an error of pose and measured landmarks that displaces both in the world.
+
+        A displacement N is an error of the pose with the landmarks along by the lever. What is left of an error is to
+        be independent of that part: ``A = (Nᵀ P⁻¹ N)⁻¹ Nᵀ P⁻¹``. None where P has lost its digits.
+        """
+        P, h, each = self.covariance, len(self.covariance.head), 3 * self.covariance.parked + self.numbers
+        across = P.head[:POSE, h + each]
+        joint = np.block([[P.pose, across], [across.T, P.marks[each[:, None], each]]])
+        N, (root, info) = np.concatenate([np.eye(POSE), self.lever.reshape(-1, POSE)]), dpotrf(joint, lower=1)
+        Z = dpotrs(root, N, lower=1)[0] if info == 0 else np.full(N.shape, np.nan)
+        return np.linalg.solve(N.T @ Z, Z.T) if np.isfinite(Z).all() else None
+
     def among_measured(self, change: Array) -> Array:
         """The part (6 + 3M,) of a change of the state (n,) that the measurements depend on."""
         return np.concatenate([change[:POSE], change[CAMERA + self.numbers]])
@@ -75,7 +94,7 @@ class Update:
         A landmark is at ``h = Rᵀ (Y − r)`` (paper B, Eqs. 3-5).
         """
         there, marks = camera or self.camera, self.landmarks
-        J = self.camera.transport(there)
+        J = np.eye(CAMERA) if camera is None else self.camera.transport(camera)
         change = np.zeros(CAMERA + len(self.covariance.marks) - 3 * self.covariance.parked)
         if camera is not None:
             change[:CAMERA] = np.linalg.solve(J, there.minus(self.camera))
@@ -86,7 +105,7 @@ class Update:
         R, r = there.pose[:3, :3], there.pose[:3, 3]
         z, by_point = self.measure.stereo.project((marks.points - r) @ R)
         own = by_point @ (R.T @ self.coordinates.jacobian(marks.anchors, marks.c))
-        lever = marks.gauge @ (there.world() @ J[:POSE, :POSE])
+        lever = self.lever if camera is None is moved else marks.gauge @ (there.world() @ J[:POSE, :POSE])
         return Linearisation(self, there, J, change, z, own, lever, from_prior)
 
     def at_guess(self) -> Linearisation:
@@ -126,18 +145,44 @@ class Linearisation:
         return np.asarray(np.isfinite(self.update.z) & np.isfinite(self.z).all(axis=1, keepdims=True))
 
     def innovation(self, components: BoolArray) -> Innovation:
-        """ν and S of some components (M, 3)."""
+        """ν and S of some components (M, 3).
+
+        If the camera transports its error, the prior has a displacement of the world as N, its derivative at the prior.
+        Elsewhere that is not quite one: ``H N = B`` is not zero, and the update would measure it. H is therefore taken
+        of what else there is of an error, ``H − B A`` with A N = 1; or, where there is no A, with the prior's lever.
+        """
         update, P = self.update, self.update.covariance
         numbers, b, h = 3 * P.parked + update.numbers, 3 * P.parked, len(P.head)
         own = self.own if components.all() else np.where(components[:, :, None], self.own, 0.0)
-        by_pose, moved = -(own @ self.lever).reshape(-1, POSE), self.change[CAMERA + update.numbers]
+        B, A, lever = (own @ (update.lever - self.lever)).reshape(-1, POSE), None, self.lever
+        if update.camera.transports and B.any():
+            A, lever = update.place, self.lever if update.place is not None else update.lever
+        H = Jacobian(own, -(own @ lever).reshape(-1, POSE), B, A)
         nu = np.where(components, update.z - self.z, 0.0).reshape(-1)
-        nu += (own @ moved.reshape(-1, 3, 1)).reshape(-1) + by_pose @ self.change[:POSE]
-        with_camera = _times(own, by_pose, P.camera[:POSE], P.head[:CAMERA, h + numbers].T)
-        with_marks = _times(own, by_pose, P.head[:POSE, h + b :], P.marks[:, b:][numbers])
-        S = _times(own, by_pose, with_camera[:, :POSE].T, with_marks[:, update.numbers].T)
+        nu += H.times(self.change[:POSE, None], self.change[CAMERA + update.numbers, None])[:, 0]
+        with_camera = H.times(P.camera[:POSE], P.head[:CAMERA, h + numbers].T)
+        with_marks = H.times(P.head[:POSE, h + b :], P.marks[:, b:][numbers])
+        S = H.times(with_camera[:, :POSE].T, with_marks[:, update.numbers].T)
         S[np.diag_indices(len(S))] += update.sigma**2
-        return Innovation(self, components, own, by_pose, (with_camera, with_marks), nu, S)
+        return Innovation(self, components, H, (with_camera, with_marks), nu, S)
+
+
+@dataclass(frozen=True, eq=False)
+class Jacobian:
+    """H (3M, 6 + 3M), by the errors of pose and measured landmarks."""
+
+    own: Array  # derivatives (M, 3, 3) of each landmark's measurement by its own coordinates
+    by_pose: Array  # and (3M, 6) by the pose's error
+    B: Array  # (3M, 6), see `Linearisation.innovation`
+    A: Array | None  # (6, 6 + 3M)
+
+    def times(self, of_pose: Array, of_marks: Array) -> Array:
+        """H (3M, ·) of a matrix with the rows (6, k) of the pose and (3M, k) of the measured landmarks."""
+        out = self.by_pose @ of_pose
+        out += (self.own @ of_marks.reshape(len(self.own), 3, -1)).reshape(out.shape)
+        if self.A is not None:
+            out -= self.B @ (self.A[:, :POSE] @ of_pose + self.A[:, POSE:] @ of_marks)
+        return np.asarray(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,8 +191,7 @@ class Innovation:
 
     at: Linearisation
     components: BoolArray  # which of the measurements' (M, 3)
-    own: Array  # H: derivatives (M, 3, 3) of each landmark's measurement by its own coordinates
-    by_pose: Array  # and (3M, 6) by the pose's error
+    H: Jacobian
     HP: tuple[Array, Array]  # H P: with the camera (3M, 12), and with the landmarks of the state (3M, 3A)
     nu: Array  # innovation of the prior's mean (3M,)
     S: Array  # its covariance (3M, 3M)
@@ -164,13 +208,6 @@ class Innovation:
         inverse = upper_inverse(upper).T
         inverse[out, out] = 0.0
         return Whitened(self, used, nu, inverse)
-
-
-def _times(own: Array, by_pose: Array, of_pose: Array, of_marks: Array) -> Array:
-    """H (3M, ·) of a matrix with the rows (6, k) of the pose and (3M, k) of the measured landmarks."""
-    out = by_pose @ of_pose
-    out += (own @ of_marks.reshape(len(own), 3, -1)).reshape(out.shape)
-    return np.asarray(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,12 +237,12 @@ class Whitened:
     def gain_root(self) -> tuple[tuple[Array, Array, Array], Array]:
         """``P Hᵀ L⁻ᵀ``, and L⁻¹ times derivatives of ν by errors of the rig; see `Covariance.corrected`."""
         nu, (with_camera, with_marks), update = self.innovation, self.innovation.HP, self.innovation.at.update
-        P, H = update.covariance, (nu.own, nu.by_pose)
+        P = update.covariance
         h, b, numbers = len(P.head), 3 * P.parked, 3 * P.parked + update.numbers
         poses_and_left = np.concatenate([P.head[CAMERA:, h + numbers].T, P.marks[:, :b][numbers]], axis=1)
-        rest = _times(*H, P.head[:POSE, CAMERA : h + b], poses_and_left)
+        rest = nu.H.times(P.head[:POSE, CAMERA : h + b], poses_and_left)
         V = dtrmm(1.0, self.inverse.T, np.concatenate([with_camera, rest], axis=1).T, side=1)
-        by_rig = _times(*H, P.by_rig[:POSE], P.by_rig[h + numbers])
+        by_rig = nu.H.times(P.by_rig[:POSE], P.by_rig[h + numbers])
         by_rig -= np.where(nu.components[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
         return (V[:h], V[h:], dtrmm(1.0, self.inverse.T, with_marks.T, side=1)), self.inverse @ by_rig
 

@@ -138,7 +138,7 @@ class FilterState:
         return self._rearranged(np.concatenate([parked, leave]), np.setdiff1d(state, leave), known)
 
     def _parts(self) -> tuple[IndexArray, IndexArray, IndexArray]:
-        """Rows of the landmarks that are parked, in the state, or are known from elsewhere."""
+        """Rows of the landmarks that are parked (they have left the state), are in it, or are known from elsewhere."""
         rows, a, b = np.arange(len(self.landmarks)), self.covariance.parked, self.covariance.correlated
         return rows[:a], rows[a:b], rows[b:]
 
@@ -158,7 +158,7 @@ class FilterState:
         Mourikis and Roumeliotis, 2010). If the camera transports its error, the covariance is therefore transported to
         the corrected state: the error is taken to be the displacement that the camera's pose has, by its Jacobian in
         old coordinates and in new, and what it leaves, which stays as it is: the error of an invariant filter (Barrau
-        and Bonnabel, 2015). Landmarks that are parked do not move, so that their coordinates need none. Raises
+        and Bonnabel, 2015). Parked landmarks do not move, so that their coordinates need none. Raises
         UnsolvableError where the new state is not finite, or a variance is lost in rounding.
         """
         update, camera = found.whitened.innovation.at.update, found.camera
@@ -167,7 +167,7 @@ class FilterState:
             raise UnsolvableError("the corrected state is not finite")
         marks.seen[update.rows[found.used]] = self.frame
         J, shift = update.camera.transport(camera), self._shift(marks, camera)
-        covariance = update.covariance.corrected(*found.information.gain_root(), J, shift)
+        covariance = update.covariance.corrected(*found.whitened.gain_root(), J, shift)
         if not (covariance.marks.diagonal() > 0).all():
             raise UnsolvableError("a landmark's variance would not stay positive")
         return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()
@@ -178,15 +178,11 @@ class FilterState:
         What moves them is an error of the rig, the last that is considered, and none of the state's.
         """
         s = self.with_all_of(ids)
-        rows = s.landmarks.rows_of(ids)
-        marks = s.landmarks.moved(
-            coordinates, rows, coordinates.of(s.landmarks.anchors[rows], points) - s.landmarks.c[rows]
-        )
+        rows, before = s.landmarks.rows_of(ids), s.landmarks
+        marks = before.moved(coordinates, rows, coordinates.of(before.anchors[rows], points) - before.c[rows])
         if not np.isfinite(marks.points).all():
             return self
-        covariance = s.covariance.displaced(rows, marks.c[rows] - s.landmarks.c[rows]).transported(
-            s._shift(marks, s.camera)
-        )
+        covariance = s.covariance.displaced(rows, (marks.c - before.c)[rows], s._shift(marks, s.camera))
         return replace(s, landmarks=marks, covariance=covariance).relieved()
 
     def _shift(self, marks: FilterLandmarks, camera: Camera) -> Array:

@@ -13,7 +13,7 @@ from backends.ekf.motion import turning
 from backends.iekf import IekfBackend
 from slam.errors import ConfigurationError
 from slam.geometry import se3
-from slam.models import EstimatorModels, MotionModel
+from slam.models import EstimatorModels, MotionModel, models_for
 from tests.backends.ekf_runs import (
     FORWARD,
     MODELS,
@@ -247,3 +247,21 @@ def test_pixels_that_are_mended_do_not_measure_the_world(make):
             backend.revise(lambda z, by=0.3 * (-1) ** k: z + np.array([0, 0, by]))
         step(backend, 0.1 * k, observe(T, points, 0.3, rng), known)
     assert (np.sqrt(np.diag(backend.estimate(False).covariance))[:3] > 0.99 * sigma).all()
+
+
+@pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])
+def test_a_long_step_does_not_depend_on_where_the_world_is(make):
+    """Points far away move by much in depth; an unknown place of all in the world must not explain that."""
+    start, known = se3.pose(np.eye(3), [30.0, 5.0, 100.0]), models_for("driving")
+    for seed in range(4):
+        rng, ends = np.random.default_rng(seed), []
+        T = se3.exp(np.concatenate([0.03 * rng.standard_normal(3), [0, 0, 1.5]]))
+        points = cloud(T[None], 80, rng, 10.0, 60.0)
+        first, second = (observe(pose, points, known.pixel_sigma, rng, 80) for pose in (np.eye(4), T))
+        for rotation, position in ((1e-5, 1e-4), (0.1, 1.0)):
+            prior = {"initial_rotation_sigma": rotation, "initial_position_sigma": position}
+            backend, seen = make(RIG, replace(known, T_world_left=start, **prior)), set()
+            step(backend, 0.0, first, seen)
+            step(backend, 0.1, second.select(np.isin(second.ids, list(seen))), seen)
+            ends.append(backend.estimate(False).T_world_left)
+        np.testing.assert_allclose(ends[1], ends[0], atol=0.01)  # 1 m where the mean followed it
