@@ -45,7 +45,7 @@ FAULTS = (
     ),
     Fault(
         "what has left the state keeps its old correlation", "backends/ekf/covariance.py",
-        "cross = self.marks[b:, :b] - V_marks @ V_left.T + shift @ head[:POSE, h : h + b]",
+        "cross = self.marks[b:, :b] - V_marks @ V_parked.T + shift @ head[:POSE, h : h + b]",
         "cross = self.marks[b:, :b] + shift @ head[:POSE, h : h + b]",
         "tests/backends/test_ekf_parts.py tests/backends/test_all_backends.py tests/backends/test_ekf.py",
     ),

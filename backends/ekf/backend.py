@@ -72,6 +72,7 @@ class EkfBackend(LandmarkFilter):
 
     def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
         self.config = from_options(EkfConfig, "ekf", options)
-        use = EkfConfig(True, "left", 1, "euclidean", False) if self.config.papers else self.config
+        papers = EkfConfig(measurement="left", iterations=1, landmarks="euclidean", consistent=False)
+        use = papers if self.config.papers else self.config
         first = EulerCamera.first(models, use.consistent)
         super().__init__(rig, models, *first, COORDINATES[use.landmarks], use.iterations, use.measurement == "stereo")

@@ -1,8 +1,9 @@
 """The filter's covariance: of what is in the state, and of what has left it.
 
-A landmark that has left is corrected no more, but its error's covariance with the state goes on: this is the filter of
-Schmidt, whose covariance is exact for what it does. With the gain of such a landmark zero, ``P_AA`` changes as ever,
-``P_Ab ← (1 − K H) P_Ab`` and ``P_bb`` not at all. When it is measured again it joins the state with its covariances.
+A landmark that has left is parked: it is corrected no more, but its error's covariance with the state goes on, as in
+the filter of Schmidt, whose covariance is exact for what it does. With the gain of such a landmark zero, ``P_AA``
+changes as ever, ``P_Ab ← (1 − K H) P_Ab`` and ``P_bb`` not at all. When it is measured again it joins the state with
+its covariances.
 The camera's last poses, as they were believed in their time, are kept in the same way (stochastic clones).
 What is known of a landmark from elsewhere is independent of all else until it is measured: nothing need be carried.
 
@@ -38,7 +39,7 @@ class Covariance:
     marks: Array  # (3B + 3A, 3B + 3A), of landmarks
     by_rig: Array  # derivatives (12 + 6K + 3B + 3A, m) of all errors by those of the rig
     known: Array  # (C, 3, 3), of each landmark that is independent of all else
-    left: int = 0  # B
+    parked: int = 0  # B
 
     @classmethod
     def of_camera(cls, P: Array, by_rig: Array | None = None) -> Covariance:
@@ -79,15 +80,6 @@ class Covariance:
         out, there = np.zeros((len(rows), 3, self.by_rig.shape[1])), rows < self.correlated
         out[there] = self.by_rig[len(self.head) + numbers_of(rows[there])].reshape(-1, *out.shape[1:])
         return out
-
-    def displaced(self, rows: IndexArray, change: Array) -> Covariance:
-        """After a change (M, 3) of some landmarks' coordinates that is none of their error.
-
-        It is that of the last of the rig's errors, which is known to be 1 (`slam.interfaces.ConsideringBackend`).
-        """
-        by_rig, there = self.by_rig.copy(), rows < self.correlated
-        by_rig[len(self.head) + numbers_of(rows[there]), -1:] -= change[there].reshape(-1, 1)
-        return replace(self, by_rig=by_rig)
 
     def joint_poses(self, J: Array, n: int) -> Array:
         """Joint covariance (6n, 6n) of the last poses, the present one, J (6, 6) times [r, φ], last."""
@@ -140,9 +132,9 @@ class Covariance:
         rig = by_pose @ self.by_rig[:POSE] + by_rig.reshape(len(rows), self.by_rig.shape[1])
         return replace(self, head=head, marks=marks, by_rig=np.concatenate([self.by_rig, rig]))
 
-    def rearranged(self, left: IndexArray, state: IndexArray, known: IndexArray) -> Covariance:
+    def rearranged(self, parked: IndexArray, state: IndexArray, known: IndexArray) -> Covariance:
         """With other landmarks in each of its parts, or fewer; by their rows of the table of landmarks."""
-        h, order, first = len(self.head), np.concatenate([left, state]), self.correlated
+        h, order, first = len(self.head), np.concatenate([parked, state]), self.correlated
         numbers = np.where(np.repeat(order, 3) < first, numbers_of(order), -1)
         marks, new = kernels.gather(self.marks, numbers, numbers), np.flatnonzero(order >= first)
         each = numbers_of(new).reshape(-1, 3)
@@ -151,7 +143,7 @@ class Covariance:
         by_rig = kernels.gather(self.by_rig[h:], numbers, np.arange(self.by_rig.shape[1]))
         return Covariance(
             np.concatenate([self.head[:, :h], head], axis=1), marks, np.concatenate([self.by_rig[:h], by_rig]),
-            self.known[known - first], len(left),
+            self.known[known - first], len(parked),
         )  # fmt: skip
 
     # --- an update ---
@@ -165,11 +157,11 @@ class Covariance:
             J: the camera's error becomes J (12, 12) times what it was,
             shift: and then to those of the landmarks this (A, 3, 6) times that of the pose is added.
         """
-        V_head, V_left, V_marks = V
-        h, b, terms = len(self.head), 3 * self.left, len(V_marks.T)
+        V_head, V_parked, V_marks = V
+        h, b, terms = len(self.head), 3 * self.parked, len(V_marks.T)
         head, by_rig, shift = self.head.copy(), self.by_rig.copy(), np.asfortranarray(shift.reshape(-1, POSE))
         head[:CAMERA, :h] -= V_head[:CAMERA] @ V_head.T
-        head[:CAMERA, h : h + b] -= V_head[:CAMERA] @ V_left.T
+        head[:CAMERA, h : h + b] -= V_head[:CAMERA] @ V_parked.T
         head[:, h + b :] -= V_head @ V_marks.T
         by_rig[:CAMERA] -= V_head[:CAMERA] @ lost_by_rig
         head[:CAMERA], by_rig[:CAMERA] = J @ head[:CAMERA], J @ by_rig[:CAMERA]
@@ -186,17 +178,22 @@ class Covariance:
             positive(marks, summands, terms)
         if b:
             state, marks = marks, self.marks.copy()
-            cross = self.marks[b:, :b] - V_marks @ V_left.T + shift @ head[:POSE, h : h + b]
+            cross = self.marks[b:, :b] - V_marks @ V_parked.T + shift @ head[:POSE, h : h + b]
             marks[b:, b:], marks[b:, :b], marks[:b, b:] = state, cross, cross.T
         by_rig[h + b :] += shift @ by_rig[:POSE] - V_marks @ lost_by_rig
         head[:, h + b :] += head[:, :POSE] @ shift.T
         return replace(self, head=head, marks=marks, by_rig=by_rig)
 
-    def transported(self, shift: Array) -> Covariance:
-        """With a shift (A, 3, 6) as `corrected` adds it, and nothing measured."""
-        h, b = len(self.head), 3 * self.left
+    def displaced(self, rows: IndexArray, change: Array, shift: Array) -> Covariance:
+        """After a change (M, 3) of some landmarks' coordinates that is none of their error, with a shift as above.
+
+        It is that of the last of the rig's errors, which is known to be 1 (`slam.interfaces.ConsideringBackend`).
+        """
+        by_rig, h, b = self.by_rig.copy(), len(self.head), 3 * self.parked
+        by_rig[h + numbers_of(rows), -1:] -= change.reshape(-1, 1)
         V = np.zeros((h, 1)), np.zeros((b, 1)), np.zeros((len(self.marks) - b, 1), order="F")
-        return self.corrected(V, np.zeros((1, self.by_rig.shape[1])), np.eye(CAMERA), shift)
+        nothing = np.zeros((1, by_rig.shape[1]))
+        return replace(self, by_rig=by_rig).corrected(V, nothing, np.eye(CAMERA), shift)
 
 
 def numbers_of(rows: IndexArray) -> IndexArray:

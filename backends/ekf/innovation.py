@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg.blas import dtrmm
-from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 
 from backends.ekf.camera import Camera
 from backends.ekf.covariance import CAMERA, POSE, Covariance, numbers_of
@@ -64,7 +64,7 @@ class Update:
     @cached_property
     def numbers(self) -> IndexArray:
         """Where the coordinates (3M,) of the measured landmarks stand among those of the state's."""
-        return numbers_of(self.rows - self.covariance.left)
+        return numbers_of(self.rows - self.covariance.parked)
 
     @cached_property
     def lever(self) -> Array:
@@ -72,24 +72,18 @@ class Update:
         return self.landmarks.gauge @ self.camera.world()
 
     @cached_property
-    def gauge(self) -> tuple[Array, Array] | None:
-        """How uncertain (6, 6) the place of camera and landmarks in the world is, and what of the state (n, 6) moves.
+    def place(self) -> Array | None:
+        """The part A (6, 6 + 3M) of an error of pose and measured landmarks that displaces both in the world.
 
-        A displacement N of the world is one of the pose with the landmarks along by the lever. With P that of pose and
-        measured landmarks its covariance is ``Σ = (Nᵀ P⁻¹ N)⁻¹``, and ``P_n P⁻¹ N`` of the state moves. None where P
-        has lost its digits.
+        A displacement N is an error of the pose with the landmarks along by the lever. What is left of an error is to
+        be independent of that part: ``A = (Nᵀ P⁻¹ N)⁻¹ Nᵀ P⁻¹``. None where P has lost its digits.
         """
-        P, b, h, each = self.covariance, 3 * self.covariance.left, len(self.covariance.head), self.numbers
-        pose = np.concatenate([P.camera[:POSE], P.head[:POSE, h + b :]], axis=1)
-        marks = np.concatenate([P.head[:CAMERA, h + b + each].T, P.marks[b + each, b:]], axis=1)
-        rows = np.concatenate([pose, marks])
-        N = np.concatenate([np.eye(POSE), self.lever.reshape(-1, POSE)])
-        root, info = dpotrf(np.concatenate([rows[:, :POSE], rows[:, CAMERA + each]], axis=1), lower=1)
-        if info != 0:
-            return None
-        along = dtrtrs(root, N, lower=1)[0]
-        own = np.linalg.inv(along.T @ along)
-        return own, rows.T @ dtrtrs(root, along, lower=1, trans=1)[0]
+        P, h, each = self.covariance, len(self.covariance.head), 3 * self.covariance.parked + self.numbers
+        across = P.head[:POSE, h + each]
+        joint = np.block([[P.pose, across], [across.T, P.marks[each[:, None], each]]])
+        N, (root, info) = np.concatenate([np.eye(POSE), self.lever.reshape(-1, POSE)]), dpotrf(joint, lower=1)
+        Z = dpotrs(root, N, lower=1)[0] if info == 0 else np.full(N.shape, np.nan)
+        return np.linalg.solve(N.T @ Z, Z.T) if np.isfinite(Z).all() else None
 
     def among_measured(self, change: Array) -> Array:
         """The part (6 + 3M,) of a change of the state (n,) that the measurements depend on."""
@@ -102,7 +96,7 @@ class Update:
         """
         there, marks = camera or self.camera, self.landmarks
         J = np.eye(CAMERA) if camera is None else self.camera.transport(camera)
-        change = np.zeros(CAMERA + len(self.covariance.marks) - 3 * self.covariance.left)
+        change = np.zeros(CAMERA + len(self.covariance.marks) - 3 * self.covariance.parked)
         if camera is not None:
             change[:CAMERA] = np.linalg.solve(J, there.minus(self.camera))
         if moved is not None:
@@ -155,27 +149,41 @@ class Linearisation:
         """ν and S of some components (M, 3).
 
         If the camera transports its error, the prior has a displacement of the world as N, its derivative at the prior.
-        Elsewhere that is not quite one: ``H N = B`` is not zero, and the mean would move along it. So the place in the
-        world counts as known here, with ``P − N Σ Nᵀ``; where Σ is not at hand, the lever is the prior's.
+        Elsewhere that is not quite one: ``H N = B`` is not zero, and the update would measure it. H is therefore taken
+        of what else there is of an error, ``H − B A`` with A N = 1; or, where there is no A, with the prior's lever.
         """
         update, P = self.update, self.update.covariance
-        numbers, b, h = 3 * P.left + update.numbers, 3 * P.left, len(P.head)
+        numbers, b, h = 3 * P.parked + update.numbers, 3 * P.parked, len(P.head)
         own = self.own if components.all() else np.where(components[:, :, None], self.own, 0.0)
-        B = (own @ (update.lever - self.lever)).reshape(-1, POSE) * update.camera.transports
-        lever = update.lever if B.any() and update.gauge is None else self.lever
-        by_pose, moved = -(own @ lever).reshape(-1, POSE), self.change[CAMERA + update.numbers]
+        B, A, lever = (own @ (update.lever - self.lever)).reshape(-1, POSE), None, self.lever
+        if update.camera.transports and B.any():
+            A, lever = update.place, self.lever if update.place is not None else update.lever
+        H = Jacobian(own, -(own @ lever).reshape(-1, POSE), B, A)
         nu = np.where(components, update.z - self.z, 0.0).reshape(-1)
-        nu += (own @ moved.reshape(-1, 3, 1)).reshape(-1) + by_pose @ self.change[:POSE]
-        with_camera = _times(own, by_pose, P.camera[:POSE], P.head[:CAMERA, h + numbers].T)
-        with_marks = _times(own, by_pose, P.head[:POSE, h + b :], P.marks[:, b:][numbers])
-        S = _times(own, by_pose, with_camera[:, :POSE].T, with_marks[:, update.numbers].T)
+        nu += H.times(self.change[:POSE, None], self.change[CAMERA + update.numbers, None])[:, 0]
+        with_camera = H.times(P.camera[:POSE], P.head[:CAMERA, h + numbers].T)
+        with_marks = H.times(P.head[:POSE, h + b :], P.marks[:, b:][numbers])
+        S = H.times(with_camera[:, :POSE].T, with_marks[:, update.numbers].T)
         S[np.diag_indices(len(S))] += update.sigma**2
-        if B.any() and update.gauge is not None:
-            sigma, along = update.gauge
-            S -= B @ sigma @ B.T
-            with_camera -= B @ sigma @ along[:CAMERA].T
-            with_marks -= B @ sigma @ along[CAMERA:].T
-        return Innovation(self, components, own, by_pose, (with_camera, with_marks), nu, S)
+        return Innovation(self, components, H, (with_camera, with_marks), nu, S)
+
+
+@dataclass(frozen=True, eq=False)
+class Jacobian:
+    """H (3M, 6 + 3M), by the errors of pose and measured landmarks."""
+
+    own: Array  # derivatives (M, 3, 3) of each landmark's measurement by its own coordinates
+    by_pose: Array  # and (3M, 6) by the pose's error
+    B: Array  # (3M, 6), see `Linearisation.innovation`
+    A: Array | None  # (6, 6 + 3M)
+
+    def times(self, of_pose: Array, of_marks: Array) -> Array:
+        """H (3M, ·) of a matrix with the rows (6, k) of the pose and (3M, k) of the measured landmarks."""
+        out = self.by_pose @ of_pose
+        out += (self.own @ of_marks.reshape(len(self.own), 3, -1)).reshape(out.shape)
+        if self.A is not None:
+            out -= self.B @ (self.A[:, :POSE] @ of_pose + self.A[:, POSE:] @ of_marks)
+        return np.asarray(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,8 +192,7 @@ class Innovation:
 
     at: Linearisation
     components: BoolArray  # which of the measurements' (M, 3)
-    own: Array  # H: derivatives (M, 3, 3) of each landmark's measurement by its own coordinates
-    by_pose: Array  # and (3M, 6) by the pose's error
+    H: Jacobian
     HP: tuple[Array, Array]  # H P: with the camera (3M, 12), and with the landmarks of the state (3M, 3A)
     nu: Array  # innovation of the prior's mean (3M,)
     S: Array  # its covariance (3M, 3M)
@@ -202,13 +209,6 @@ class Innovation:
         inverse = _inverse(upper).T
         inverse[out, out] = 0.0
         return Whitened(self, used, nu, inverse)
-
-
-def _times(own: Array, by_pose: Array, of_pose: Array, of_marks: Array) -> Array:
-    """H (3M, ·) of a matrix with the rows (6, k) of the pose and (3M, k) of the measured landmarks."""
-    out = by_pose @ of_pose
-    out += (own @ of_marks.reshape(len(own), 3, -1)).reshape(out.shape)
-    return np.asarray(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,12 +238,12 @@ class Whitened:
     def gain_root(self) -> tuple[tuple[Array, Array, Array], Array]:
         """``P Hᵀ L⁻ᵀ``, and L⁻¹ times derivatives of ν by errors of the rig; see `Covariance.corrected`."""
         nu, (with_camera, with_marks), update = self.innovation, self.innovation.HP, self.innovation.at.update
-        P, H = update.covariance, (nu.own, nu.by_pose)
-        h, b, numbers = len(P.head), 3 * P.left, 3 * P.left + update.numbers
+        P = update.covariance
+        h, b, numbers = len(P.head), 3 * P.parked, 3 * P.parked + update.numbers
         poses_and_left = np.concatenate([P.head[CAMERA:, h + numbers].T, P.marks[:, :b][numbers]], axis=1)
-        rest = _times(*H, P.head[:POSE, CAMERA : h + b], poses_and_left)
+        rest = nu.H.times(P.head[:POSE, CAMERA : h + b], poses_and_left)
         V = dtrmm(1.0, self.inverse.T, np.concatenate([with_camera, rest], axis=1).T, side=1)
-        by_rig = _times(*H, P.by_rig[:POSE], P.by_rig[h + numbers])
+        by_rig = nu.H.times(P.by_rig[:POSE], P.by_rig[h + numbers])
         by_rig -= np.where(nu.components[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
         return (V[:h], V[h:], dtrmm(1.0, self.inverse.T, with_marks.T, side=1)), self.inverse @ by_rig
 

@@ -7,8 +7,7 @@ by ``P Hᵀ y``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf
@@ -34,7 +33,7 @@ _HALVINGS = 6  # numerics: of a step that does not lower the cost
 class Posterior:
     """The maximum of the posterior (or one step towards it)."""
 
-    whitened: Whitened  # the last innovation of the mean
+    whitened: Whitened  # the last innovation, from which the covariance follows
     change: Array  # of the state (n,) from the prior, in the prior's coordinates
 
     @property
@@ -46,19 +45,6 @@ class Posterior:
     def camera(self) -> Camera:
         """After the update."""
         return self.whitened.innovation.at.camera_after(self.change)
-
-    @cached_property
-    def information(self) -> Whitened:
-        """The innovation that the covariance follows from.
-
-        If the camera transports its error, its pose moves landmarks as it does at the prior: H is zero along every
-        displacement of the world as the prior's covariance has it.
-        """
-        innovation = self.whitened.innovation
-        at, update = innovation.at, innovation.at.update
-        if not (update.camera.transports and at.change.any()):
-            return self.whitened
-        return replace(at, lever=update.lever).innovation(innovation.components).whitened(self.used)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +84,7 @@ def solve(gated: Gated) -> Posterior | None:
         if faced.camera is not update.camera:  # the coordinates of its error are nearly singular there
             found, update = _twice(gate(faced, at_guess=True)), faced
     if found is not None:
-        root = found.information.by_pose
+        root = found.whitened.by_pose
         if dpotrf(update.covariance.pose - root.T @ root, lower=1)[1] != 0:
             raise UnsolvableError("the pose's covariance would not stay positive definite")
     return found
@@ -169,7 +155,8 @@ def _iterate(whitened: Whitened) -> Posterior:
             raise UnsolvableError("the corrected state is not finite")
         if update.iterations == 1 or _linear(whitened, change):
             return Posterior(whitened, change)
-        towards = np.concatenate([y @ innovation.by_pose, (y.reshape(-1, 1, 3) @ innovation.own).reshape(-1)])  # Hᵀ y
+        H = innovation.H
+        towards = np.concatenate([y @ H.by_pose, (y.reshape(-1, 1, 3) @ H.own).reshape(-1)])  # Hᵀ y
         following, step = _descend(now, components, towards, change)
         reached = reached if following is now else Posterior(whitened, step)
         if iteration == 1 and update.guess is not None:

@@ -97,32 +97,32 @@ class FilterState:
 
     def with_all_of(self, ids: IdArray) -> FilterState:
         """With some landmarks (M,), which may have left it or be known from elsewhere, in the state."""
-        rows, (left, state, known) = self.landmarks.rows_of(ids), self._parts()
-        back = np.sort(rows[(rows < len(left)) | (rows >= len(left) + len(state))])
+        rows, (parked, state, known) = self.landmarks.rows_of(ids), self._parts()
+        back = np.sort(rows[(rows < len(parked)) | (rows >= len(parked) + len(state))])
         if not len(back):
             return self
-        return self._rearranged(np.setdiff1d(left, back), np.concatenate([state, back]), np.setdiff1d(known, back))
+        return self._rearranged(np.setdiff1d(parked, back), np.concatenate([state, back]), np.setdiff1d(known, back))
 
     def relieved(self) -> FilterState:
         """Where the state is too large, without those not measured for longest."""
-        (left, state, known), seen = self._parts(), self.landmarks.seen
+        (parked, state, known), seen = self._parts(), self.landmarks.seen
         if len(state) <= _MOST:
             return self
         old = state[seen[state] < self.frame]
         leave = np.sort(old[np.argsort(seen[old], kind="stable")][: max(len(state) - _LEAST, 0)])
         if not len(leave):
             return self
-        return self._rearranged(np.concatenate([left, leave]), np.setdiff1d(state, leave), known)
+        return self._rearranged(np.concatenate([parked, leave]), np.setdiff1d(state, leave), known)
 
     def _parts(self) -> tuple[IndexArray, IndexArray, IndexArray]:
-        """Rows of the landmarks that have left the state, are in it, or are known from elsewhere."""
-        rows, a, b = np.arange(len(self.landmarks)), self.covariance.left, self.covariance.correlated
+        """Rows of the landmarks that are parked (they have left the state), are in it, or are known from elsewhere."""
+        rows, a, b = np.arange(len(self.landmarks)), self.covariance.parked, self.covariance.correlated
         return rows[:a], rows[a:b], rows[b:]
 
-    def _rearranged(self, left: IndexArray, state: IndexArray, known: IndexArray) -> FilterState:
+    def _rearranged(self, parked: IndexArray, state: IndexArray, known: IndexArray) -> FilterState:
         """With the landmarks of these rows of the table in each part."""
-        landmarks = self.landmarks.select(np.concatenate([left, state, known]))
-        return replace(self, landmarks=landmarks, covariance=self.covariance.rearranged(left, state, known))
+        landmarks = self.landmarks.select(np.concatenate([parked, state, known]))
+        return replace(self, landmarks=landmarks, covariance=self.covariance.rearranged(parked, state, known))
 
     # --- updates ---
 
@@ -135,7 +135,7 @@ class FilterState:
         Mourikis and Roumeliotis, 2010). If the camera transports its error, the covariance is therefore transported to
         the corrected state: the error is taken to be the displacement that the camera's pose has, by its Jacobian in
         old coordinates and in new, and what it leaves, which stays as it is: the error of an invariant filter (Barrau
-        and Bonnabel, 2015). Landmarks that have left do not move, so that their coordinates need none. Raises
+        and Bonnabel, 2015). Parked landmarks do not move, so that their coordinates need none. Raises
         UnsolvableError where the new state is not finite, or a variance is lost in rounding.
         """
         update, camera = found.whitened.innovation.at.update, found.camera
@@ -144,7 +144,7 @@ class FilterState:
             raise UnsolvableError("the corrected state is not finite")
         marks.seen[update.rows[found.used]] = self.frame
         J, shift = update.camera.transport(camera), self._shift(marks, camera)
-        covariance = update.covariance.corrected(*found.information.gain_root(), J, shift)
+        covariance = update.covariance.corrected(*found.whitened.gain_root(), J, shift)
         if not (covariance.marks.diagonal() > 0).all():
             raise UnsolvableError("a landmark's variance would not stay positive")
         return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()
@@ -155,15 +155,11 @@ class FilterState:
         What moves them is an error of the rig, the last that is considered, and none of the state's.
         """
         s = self.with_all_of(ids)
-        rows = s.landmarks.rows_of(ids)
-        marks = s.landmarks.moved(
-            coordinates, rows, coordinates.of(s.landmarks.anchors[rows], points) - s.landmarks.c[rows]
-        )
+        rows, before = s.landmarks.rows_of(ids), s.landmarks
+        marks = before.moved(coordinates, rows, coordinates.of(before.anchors[rows], points) - before.c[rows])
         if not np.isfinite(marks.points).all():
             return self
-        covariance = s.covariance.displaced(rows, marks.c[rows] - s.landmarks.c[rows]).transported(
-            s._shift(marks, s.camera)
-        )
+        covariance = s.covariance.displaced(rows, (marks.c - before.c)[rows], s._shift(marks, s.camera))
         return replace(s, landmarks=marks, covariance=covariance).relieved()
 
     def _shift(self, marks: FilterLandmarks, camera: Camera) -> Array:

@@ -88,9 +88,9 @@ def rounds(monkeypatch, make, most: int) -> EkfBackend:
 @pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])
 def test_landmarks_leave_the_state_and_come_back(make, monkeypatch):
     whole, some = rounds(monkeypatch, make, 1000), rounds(monkeypatch, make, 60)
-    assert whole.state.covariance.left == 0
-    assert some.state.covariance.correlated - some.state.covariance.left <= 60
-    assert some.state.covariance.left > 60
+    assert whole.state.covariance.parked == 0
+    assert some.state.covariance.correlated - some.state.covariance.parked <= 60
+    assert some.state.covariance.parked > 60
     a, b = whole.estimate(), some.estimate()
     np.testing.assert_array_equal(a.ids, b.ids)
     # what is no longer corrected is known a little less well, but not much: nor does it spoil the camera

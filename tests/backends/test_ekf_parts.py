@@ -13,7 +13,7 @@ from backends.ekf.innovation import UnsolvableError, Update, Whitened
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth
 from backends.ekf.motion import EulerCamera
 from backends.ekf.recovery import agreement
-from backends.ekf.solve import Posterior, _descend, gate, solve
+from backends.ekf.solve import _descend, gate, solve
 from backends.ekf.state import FilterState
 from slam.geometry import se3
 from slam.geometry.se3 import body_rate_matrix, rotation
@@ -408,7 +408,7 @@ def test_depths_that_move_do_not_bend_the_pose():
         s, update, truth = far_in_depth(seed)
         after = s.corrected(solve(replace(gate(update), limits=np.full(15, 1e9))))
         off.append(np.linalg.norm(after.pose[:3, 3] - truth[:3, 3]))
-    assert np.sqrt(np.mean(np.square(off))) < 0.045  # 28 mm for least squares; .097 with the levers of the prior
+    assert np.sqrt(np.mean(np.square(off))) < 0.035  # .028, as least squares; .047 with the lever of the prior
 
 
 def test_a_coordinate_at_its_limit_has_changed_by_so_much():
@@ -416,7 +416,7 @@ def test_a_coordinate_at_its_limit_has_changed_by_so_much():
     s, update, _ = far_in_depth(0)
     asked = np.zeros(45)
     asked[2] = -2 * s.landmarks.c[0, 2]
-    at = update.at(None, asked)
+    at = replace(update, camera=replace(s.camera, transports=False)).at(None, asked)
     made = (InverseDepth().moved(s.landmarks.c, asked.reshape(-1, 3)) - s.landmarks.c).reshape(-1)
     assert made[2] > asked[2]
     np.testing.assert_array_equal(at.change[12:], made)
@@ -503,8 +503,7 @@ def test_no_linearisation_measures_a_displacement_of_the_world(coordinates, tran
     for camera in (None, there):
         change = 0.02 * rng.standard_normal((12, 3)) * s.landmarks.c
         at = update.at(camera, change.reshape(-1))
-        mean = at.innovation(np.ones((12, 3), bool)).whitened(np.ones(12, bool))
-        H = np.concatenate(Posterior(mean, at.change).information.innovation.HP, axis=1)
+        H = np.concatenate(at.innovation(np.ones((12, 3), bool)).HP, axis=1)
         U = np.zeros((48, 6))
         U[:6] = np.linalg.inv((s.camera if transports else at.camera).world())
         marks = s.landmarks if transports else s.landmarks.moved(coordinates, slice(None), change)
