@@ -178,38 +178,51 @@ def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) 
     )
 
 
-def row_flow(features: StereoFeatures, T_other_now: Array, rig: StereoRig) -> tuple[float, float]:
-    """Sums of products over a frame's features: vertical disparity times flow, and flow times flow [px²].
+def row_flow(features: StereoFeatures, T_other_now: Array, rig: StereoRig) -> Array:
+    """Sums of products (7, 7) over a frame's features [px²]: of vertical disparities, of the flow, and of `_fields`.
 
     The flow is how many rows a still point moves in the left image from another frame to this one; `T_other_now` (4, 4)
     takes this frame's camera coordinates to the other's. A right image from between them is off by a share of it.
     """
     rows, rectified, R = np.flatnonzero(features.has_stereo), rig.rectified, rig.rectified.R_left
     left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
+    camera = rectified.rig.left
     with np.errstate(all="ignore"):
         points = rectified.rig.triangulate(left, np.column_stack([right[:, 0], left[:, 1]]))
         there = (points @ R @ T_other_now[:3, :3].T + T_other_now[:3, 3]) @ R.T
-        other = rectified.rig.left.project(there)
-    flow, vertical = left[:, 1] - other[:, 1], right[:, 1] - left[:, 1]
-    good = np.isfinite(flow + vertical) & (np.abs(flow) < _FLOW)
-    return float(flow[good] @ vertical[good]), float(flow[good] @ flow[good])
+        flow = left[:, 1] - camera.project(there)[:, 1]
+        columns = np.column_stack([right[:, 1] - left[:, 1], flow, *_fields(points)])
+    columns = columns[np.isfinite(columns).all(axis=1) & (np.abs(flow) < _FLOW)]
+    return np.asarray(columns.T @ columns)
+
+
+def _fields(points: Array) -> tuple[Array, ...]:
+    """How vertical disparities (N,) of points in the camera's axes may be off by the calibration, up to factors.
+
+    A right camera that is turned by a small angle, of another focal length or principal point, or higher or lower.
+    """
+    x, y, z = points.T
+    x, y, one = x / z, y / z, np.ones(len(points))
+    return one, x, y, x * y, one / z
 
 
 def moment_doubt(record: RunRecord) -> str:
     """What to say where rows of left and right features differ as they do between images of two moments.
 
     The lag of the right images, in frames, is the regression of vertical disparities on the flow along columns from the
-    frame before; how early they are, on that from the frame after. Rows that differ because of the calibration do so in
-    the same way whatever the motion is.
+    frame before; how early they are, on that from the frame after. What errors of the calibration explain, which are
+    the same in all frames, is taken out of both first: a camera that drives straight on moves rows in one way, too.
     """
     found = {"": _LAG}
-    for word, flows in zip(("late", "early"), np.array(record.row_flows).reshape(-1, 2, 2).swapaxes(0, 1)):
-        while len(flows) >= _LEAST_FLOWS:  # of all frames, of the last half, … : an image may be missing in the middle
-            products, squares = flows.T
+    for word, sums in zip(("late", "early"), np.array(record.row_flows).reshape(-1, 2, 7, 7).swapaxes(0, 1)):
+        while len(sums) >= _LEAST_FLOWS:  # of all frames, of the last half, … : an image may be missing in the middle
+            whole = sums.sum(axis=0)
+            less = np.concatenate([np.eye(2), -np.linalg.lstsq(whole[2:, 2:], whole[2:, :2], rcond=None)[0]])
+            products, squares = (less.T @ sums @ less)[:, :, 1].T
             lag = -products.sum() / max(squares.sum(), np.finfo(float).tiny)
             if lag * squares.sum() > _LAG_SIGMAS * np.sqrt(np.square(products + lag * squares).sum()):
                 found[word] = max(lag, found.get(word, 0.0))
-            flows = flows[len(flows) // 2 :]
+            sums = sums[len(sums) // 2 :]
     word = max(found, key=lambda word: found[word])
     return word and (
         "left and right image are not of one moment: rows of their features differ with the motion, as if right images "

@@ -156,7 +156,7 @@ class _Run:
             if result.status.measured and before is not None and before.status.measured:
                 step = inverse(before.estimate.T_world_left) @ result.estimate.T_world_left
                 late = row_flow(result.features, step, system.rig)
-                record.row_flows.append((*late, *row_flow(before.features, inverse(step), system.rig)))
+                record.row_flows.append((late, row_flow(before.features, inverse(step), system.rig)))
             before = result
             yield frame.index, result
             for watch in watches:

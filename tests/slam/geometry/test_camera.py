@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.geometry.camera import PinholeCamera
+from slam.geometry.camera import PinholeCamera, size_doubt
 
 CAMERAS = {
     "ideal": PinholeCamera(260, 255, 160, 118, 320, 240),
@@ -65,3 +65,9 @@ def test_far_rays_are_not_folded_back_into_the_image():
     inside = camera.in_image(uv)
     assert inside[0]
     assert not inside[np.argmin(inside) :].any()  # once out of the image, never in again
+
+
+@pytest.mark.parametrize(("x", "y", "doubted"), [(1.06, 1.07, False), (1.25, 1.25, True), (0.75, 0.75, True)])
+def test_a_principal_point_is_doubted_from_another_size_on_and_not_by_its_usual_scatter(x, y, doubted):
+    camera = PinholeCamera(450, 450, x * 319.5, y * 239.5, 640, 480)
+    assert bool(size_doubt(camera, camera)) == doubted
