@@ -91,9 +91,7 @@ def _agreed(gated: Gated) -> Posterior | None:
     used, count = 0 if found is None else int(found.used.sum()), len(gated.used)
     if count < MIN_OBSERVATIONS or ONE_AGREES_IN * used >= count:
         return found
-    rejected, models = (
-        gated.distances[~gated.used & np.isfinite(gated.distances)],
-        gated.innovation.at.update.measure.models,
-    )
-    chance = by_chance(rejected, used, count, float(gated.limits.max()), models.gate_probability)
+    rejected = gated.distances[~gated.used & np.isfinite(gated.distances)]
+    probability = gated.innovation.at.update.measure.models.gate_probability
+    chance = by_chance(rejected, used, count, float(gated.limits.max()), probability)
     return None if chance else found
