@@ -17,6 +17,7 @@ from slam.interfaces import Backend
 from slam.testing import BACKEND_CHECKS, RIG, RIGHT, RUNS, check_backend, findings, protocol
 from slam.testing.__main__ import main
 from tests.backends.hostile_calls import play
+from tests.scripts import load_script
 
 ROOT = Path(__file__).parents[2]
 
@@ -33,6 +34,11 @@ NAMES = [pytest.param(n, marks=pytest.mark.slow) if n == "batch" else n for n in
 @pytest.mark.parametrize("name", NAMES)
 def test_contract(name, check):
     check(registry.resolve("backends", name))
+
+
+@pytest.mark.parametrize("check", BACKEND_CHECKS, ids=by_name)
+def test_the_filter_of_the_docs_passes_the_whole_contract(check):
+    check(load_script("docs/examples/small_filter.py").SmallFilter)
 
 
 class Own(EkfBackend):
