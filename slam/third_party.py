@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.checks import LATEST_STAMP
+from slam.checks import LATEST_STAMP, is_rigid
 from slam.data import Estimate, Patches, Prediction, UpdateReport, UpdateStatus
 from slam.errors import PartError, SlamError, cause, text_of
 
@@ -59,6 +59,8 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
                 raise SlamError(f"{where} must be an array of ids, got {value.dtype}")
             if name in _FINITE and not np.isfinite(value).all():
                 raise SlamError(f"{where} is not finite")
+            if name == "T_world_left" and not is_rigid(value, 1e-3):
+                raise SlamError(f"{where} is no rotation and translation")
             if name in _COVARIANCES and (value.diagonal(0, -2, -1) < -1e-9).any():  # 1e-9: rounding
                 raise SlamError(f"{where} has a negative variance")
         elif not isinstance(value, wanted):

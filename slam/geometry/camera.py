@@ -209,10 +209,11 @@ def baseline_doubt(baseline: float) -> str:
 #: the same of one that is off to the same side in all directions and cameras, as with images of another size. Right
 #: ones scatter by about 0.04, and those of a rectified pair are two numbers, not four.
 _OFF, _OFF_ALIKE = 0.3, 0.1
+_OBLONG = 0.1  # guard: largest difference of the focal lengths along rows and columns, as a share: pixels are square
 
 
 def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
-    """What is wrong with a principal point far from the middle of the images; empty if it is near."""
+    """What is wrong with a principal point far from the middle, or pixels that are not square; empty for neither."""
     cameras = {"left": left, "right": right}
     shares = {
         side: np.array([2 * camera.u0 / (camera.width - 1), 2 * camera.v0 / (camera.height - 1)]) - 1
@@ -221,6 +222,11 @@ def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
     every = np.concatenate(list(shares.values()))
     alike = bool(every.min() > _OFF_ALIKE or every.max() < -_OFF_ALIKE)
     for side, camera in cameras.items():
+        if abs(camera.fu / camera.fv - 1) > _OBLONG:
+            return (
+                f"the focal lengths of the {side} camera, {camera.fu:.0f} px along rows and {camera.fv:.0f} px along "
+                "columns, differ, but pixels are square: is one of them mistyped, or were images scaled in one way?"
+            )
         if alike or np.abs(shares[side]).max() > _OFF:
             return (
                 f"the principal point of the {side} camera, ({camera.u0:.0f}, {camera.v0:.0f}) px, is far from the "

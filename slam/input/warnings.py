@@ -63,10 +63,8 @@ class InputWarnings:
         self._fits = np.zeros(1 + 2 * _SHIFTS, int)  # matches if right images are a frame late, early, two late, …
         self._level = 0  # of the same frames, if rows are shifted
         self._grain_warned = False
-        for unlikely, no_path in ((baseline_doubt(rig.baseline), True), (size_doubt(rig.left, rig.right), False)):
-            if not unlikely:
-                continue
-            self._warn(unlikely, no_path)
+        for unlikely in filter(None, (baseline_doubt(rig.baseline), size_doubt(rig.left, rig.right))):
+            self._warn(unlikely, no_path=True)
             self._pair_warned = self._partners_explained = True  # and what follows from it is not
 
     def look(self, frame: StereoFrame, features: StereoFeatures) -> None:

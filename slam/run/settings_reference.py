@@ -65,15 +65,14 @@ def _options_of(section: str, name: str) -> Iterator[Setting]:
 def listing(wanted: str | None, width: int) -> Iterator[str]:
     """Lines of at most `width` characters on all settings, or those of a section, front end or back end, or one.
 
-    Raises UnknownNameError where there is no such section or setting, or a class of one's own has no options.
+    Raises UnknownNameError where there is no such section or setting.
     """
     if wanted is not None and ":" in wanted:  # a class of one's own
         part = registry.resolve("backends", wanted)
         chosen = list(_options_of("frontend" if hasattr(part, "extract") else "backend", wanted))
         if not chosen:
-            raise UnknownNameError(
-                f"{wanted} names no options: neither its constructor has any, nor a dataclass in its `config`"
-            )
+            yield f"{wanted} has no options: neither its constructor has any, nor a dataclass in its `config`."
+            return
     else:
         every = list(settings())
         chosen = [s for s in every if wanted is None or wanted in (s.key, s.owner) or s.key.startswith(f"{wanted}.")]

@@ -34,6 +34,11 @@ class Changed(EkfBackend):
 ANSWERS = [
     ("predict", lambda p: None, "predict: must be of type Prediction"),
     ("predict", lambda p: replace(p, T_world_left=np.full((4, 4), np.nan)), "predict: T_world_left is not finite"),
+    (
+        "predict",
+        lambda p: replace(p, T_world_left=np.diag([1.1, 1.1, 1.1, 1])),
+        "predict: .* no rotation and translation",
+    ),
     ("predict", lambda p: replace(p, covariance=np.eye(3)), "predict: covariance must be an array"),
     ("predict", lambda p: replace(p, uv_left=p.uv_left[None]), "predict: uv_left"),
     ("update", lambda r: None, "update: must be of type UpdateReport"),

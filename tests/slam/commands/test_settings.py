@@ -101,8 +101,7 @@ def test_options_of_a_class_of_one_s_own_are_listed_and_named_in_errors(tmp_path
         ConfigurationError, match=r"unknown option 'leest' \(did you mean 'least'\?\); known: least, pap"
     ):
         registry.create("backends", "own_options:Near", RIG, leest=3.0)
-    with pytest.raises(SlamError, match="names no options"):
-        list(listing("own_options:Plain", 80))
+    assert "own_options:Plain has no options" in next(listing("own_options:Plain", 80))
     config = SystemConfig().with_settings({"backend.leest": 3.0})
     with pytest.raises(ConfigurationError, match=r"backend\.leest: an object is made with its options"):
         slam.StereoSlam(RIG, backend=registry.create("backends", "ekf", RIG.rectified.rig), config=config)

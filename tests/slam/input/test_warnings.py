@@ -102,6 +102,7 @@ def unlike_cameras(turn, *lenses):
 DISTORTED = unlike_cameras([0.01, 0.02, -0.01], (-0.25, 0.08), (-0.26, 0.08))
 _LENS = PinholeCamera(260.0, 260.0, 159.5, 119.5, 320, 240, "radtan", (-0.37, 0.2, 0.0, 0.0))
 ALIKE = slam.StereoRig(_LENS, _LENS, np.eye(3), np.array([-0.12, 0.0, 0.0]))  # most rows agree to a pixel all the same
+OBLONG = PinholeCamera(300.0, 350.0, 160.0, 120.0, 320, 240)
 KITTI = slam.StereoRig.rectified_pair(718.9, 607.2, 185.2, 0.54, 1241, 376)
 
 
@@ -156,6 +157,10 @@ SAID = {
     "of a size a fifth larger": (every(3), {"rig": of_size(1.2)}, "middle of the images.* cropped or turned"),
     "cx and cy exchanged": (
         every(3), {"rig": slam.StereoRig.rectified_pair(300.0, 120.0, 160.0, 0.12, 320, 240)}, "cx and cy exchanged"
+    ),
+    "fx and fy": (
+        every(3), {"rig": slam.StereoRig(*2 * [OBLONG], np.eye(3), np.array([-0.12, 0, 0]))},
+        "300 px along rows and 350 px along columns, differ, but pixels are square",
     ),
     "turned": (every(3, turned), {}, "the images are turned by 90°, or the cameras stand above each other"),
     "bytes exchanged": (
@@ -353,3 +358,7 @@ def test_a_repeated_pattern_is_named_as_the_reason():
     column = np.ones(200)
     (line,) = lines(every(6), stereo=0, uv_left=uv, descriptors=two, scale=8 * column, laplacian=np.ones(200, np.int8))
     assert "only 0 of 200 features" in line and "the view is a repeated pattern: 200 of them have a look-alike" in line
+
+
+def test_a_calibration_that_cannot_be_that_of_the_images_leaves_no_path_to_trust():
+    assert InputWarnings(of_size(0.5), models_for("handheld"), 1.5).doubt
