@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from backends.window.state import WindowState, settle
 from backends.window.steps import Steps
 from slam.data import IdArray
+from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array
 from slam.window import chart_kernels
 from slam.window.stereo import RectifiedStereo
@@ -60,7 +61,7 @@ class History:
                 z = np.where((z[:, 0] > z[:, 2])[:, None], z, before)
             return call[0], (ids, z, *rest)
 
-        return replace(self, parts=tuple(
+        return changed(self, parts=tuple(
             (state_corrected(state, stereo, correct), tuple(map(again, calls))) for state, calls in self.parts
         ))  # fmt: skip
 
@@ -109,8 +110,8 @@ def state_corrected(
         by_rig = prior.by_rig.copy()
         if not whole:
             by_rig[:, -1:] -= (prior.information[:, : change.size] @ change.ravel())[:, None]
-        prior = replace(prior, origin=prior.origin + change, by_rig=by_rig)
-    rows = replace(s.rows, z=stereo.corrected("window", s.rows.z, correct))
+        prior = changed(prior, origin=prior.origin + change, by_rig=by_rig)
+    rows = changed(s.rows, z=stereo.corrected("window", s.rows.z, correct))
     displacement = position - marks.position
 
     def shift(own: IdArray) -> Array:
@@ -121,7 +122,7 @@ def state_corrected(
     past = s.past
     if len(marks):  # as if they had stood there before
         past = tuple(
-            replace(
+            changed(
                 one,
                 points=one.points + shift(one.serials),
                 stayed_points=one.stayed_points + shift(one.stayed_serials),
@@ -131,4 +132,4 @@ def state_corrected(
     by_rig = marks.by_rig.copy()
     if not whole:
         by_rig[:, :, -1:] -= displacement[:, :, None]
-    return replace(s, rows=rows, landmarks=replace(marks, position=position, by_rig=by_rig), prior=prior, past=past)
+    return changed(s, rows=rows, landmarks=changed(marks, position=position, by_rig=by_rig), prior=prior, past=past)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from backends.window.state import Left, WindowConfig, WindowState
 from slam.data import BoolArray
-from slam.geometry.arrays import among
+from slam.geometry.arrays import among, changed
 from slam.window.marginal import marginalised
 from slam.window.problem import Window
 from slam.window.stereo import Field, RectifiedStereo
@@ -52,7 +50,7 @@ def slid(s: WindowState, stereo: RectifiedStereo, config: WindowConfig, field: F
     taken_rows = its_rows & (member | joins)[rows.point] | ends[rows.point]
     taken_places = its_places | ends[places.point]
     moves = (gone[s.motion.poses] & (s.motion.poses >= 0)).any(axis=1)
-    w = replace(
+    w = changed(
         problem(s, stereo), rows=rows.select(taken_rows), places=places.select(taken_places),
         motion=s.motion.select(moves), joining=np.flatnonzero(joins),
         information=np.where((member | joins | ends)[:, None, None], marks.information, 0.0),
@@ -71,17 +69,17 @@ def slid(s: WindowState, stereo: RectifiedStereo, config: WindowConfig, field: F
     free = marks.information
     if (joins | ends).any():
         free = np.where((joins | ends)[:, None, None], 0.0, free)
-    marks = replace(marks, information=free)
+    marks = changed(marks, information=free)
     if not used.all():  # landmarks that were removed take no part any more
         index, marks = np.cumsum(used) - 1, marks.select(used)
     each, place = np.repeat(stays, 6), np.cumsum(stays) - 1
-    return replace(
+    return changed(
         s, frames=s.frames[stays], stamps=s.stamps[stays], poses=s.poses[stays], covariance=s.covariance[each][:, each],
         by_rig=s.by_rig[each], solved=int(place[s.solved]), cost=s.cost - cost, past=(*s.past, left),
-        rows=replace(rows, pose=place[rows.pose], point=index[rows.point]),
-        places=replace(places, pose=place[places.pose], point=index[places.point]),
-        motion=replace(motion, poses=np.where(motion.poses < 0, -1, place[motion.poses])),
-        prior=replace(prior, points=index[stay]), landmarks=marks,
+        rows=changed(rows, pose=place[rows.pose], point=index[rows.point]),
+        places=changed(places, pose=place[places.pose], point=index[places.point]),
+        motion=changed(motion, poses=np.where(motion.poses < 0, -1, place[motion.poses])),
+        prior=changed(prior, points=index[stay]), landmarks=marks,
     )  # fmt: skip
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from slam.bounds import require_not_negative
 from slam.data import IdArray, IndexArray
-from slam.geometry.arrays import LandmarkRows
+from slam.geometry.arrays import LandmarkRows, changed
 from slam.geometry.se3 import Array, exp, inverse, log
 from slam.window.marginal import Conditional
 from slam.window.problem import Motion, Places, RelativePrior, Rows
@@ -108,8 +108,7 @@ class WindowState:
         """Covariance (6, 6) of the newest pose relative to another one of the window, both perturbed on the right."""
         if earlier == len(self.frames) - 1:
             return np.zeros((6, 6))
-        both = np.concatenate([6 * earlier + np.arange(6), np.arange(-6, 0)])
-        return relative_covariance(self.covariance[np.ix_(both, both)], self.poses[earlier], self.poses[-1])
+        return relative_covariance(self.covariance, self.poses[earlier], self.poses[-1], 6 * earlier)
 
     def revised_poses(self) -> dict[int, Array]:
         """Poses (4, 4) by frame, of the window and of its past.
@@ -136,6 +135,8 @@ def settle(before: WindowState, after: WindowState, lag: int) -> tuple[WindowSta
     """
     if after.begun != before.begun:  # the problem was begun anew: what was before is final
         return after, before.revised_poses()
+    if after.past is before.past:
+        return after, {}
     surplus = sum(len(one.frames) for one in after.past) - lag
     if surplus <= lag // 2:
         return after, {}
@@ -144,4 +145,4 @@ def settle(before: WindowState, after: WindowState, lag: int) -> tuple[WindowSta
     while len(final) < surplus:
         final += after.past[cut].frames.tolist()
         cut += 1
-    return replace(after, past=after.past[cut:]), {frame: poses[frame] for frame in final}
+    return changed(after, past=after.past[cut:]), {frame: poses[frame] for frame in final}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from backends.window.slide import problem, slid
 from backends.window.state import WindowConfig, WindowLandmarks, WindowState
 from slam.chi_square import chi_square_limits
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
-from slam.geometry.arrays import among
+from slam.geometry.arrays import among, changed
 from slam.geometry.kernels import seen
 from slam.geometry.se3 import Array, points_by_pose
 from slam.window import chart_kernels, motion, pose_only
@@ -44,7 +44,7 @@ class Steps(RectifiedMeasurement):
             sigmas = np.repeat([self.models.initial_rotation_sigma, self.models.initial_position_sigma], 3)
             P, prior = np.diag(sigmas**2), RelativePrior.of_pose(T, np.diag(sigmas**2), s.by_rig)
             first = np.zeros(1, np.int64)
-            return replace(s, frames=first, stamps=np.array([stamp]), poses=T[None], covariance=P, prior=prior)
+            return changed(s, frames=first, stamps=np.array([stamp]), poses=T[None], covariance=P, prior=prior)
         if len(s.frames) >= self.config.poses:
             try:
                 s = slid(s, self.stereo, self.config, self.field)
@@ -65,7 +65,7 @@ class Steps(RectifiedMeasurement):
             one = np.array([[-1 if unknown else K - 2, K - 1, K]])
             sigma = np.full(6, motion.STANDS / dt) if rests else motion.velocity_sigmas(self.models, dt, unknown)
             moves = moves.joined(Motion(one, np.array([[before or 1.0, dt]]), np.zeros((1, 6)), sigma[None] ** 2))
-        return replace(
+        return changed(
             s, frames=np.append(s.frames, s.frames[-1] + 1), stamps=np.append(t, stamp), motion=moves,
             poses=np.concatenate([s.poses, T[None]]), covariance=P, measured=False,
             by_rig=np.concatenate([s.by_rig, J @ s.by_rig]),
@@ -83,12 +83,12 @@ class Steps(RectifiedMeasurement):
 
     def updated(self, s: WindowState, ids: IdArray, z: Array, guess: Array | None) -> tuple[WindowState, UpdateReport]:
         """After measurements z (M, 3) of landmarks."""
-        points, s = s.landmarks.rows_of(ids), replace(s, measured=True)
+        points, s = s.landmarks.rows_of(ids), changed(s, measured=True)
         if not len(points):
             return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
         try:
             found = self._agreement(s, points, z, guess)
-            s = replace(s, contradicted=found.contradicted)
+            s = changed(s, contradicted=found.contradicted)
             if not found.used.any():
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", ids.copy())
             return self._solved(s, found, points, ids, z)
@@ -103,7 +103,7 @@ class Steps(RectifiedMeasurement):
         s.landmarks.require_new(ids)
         s = _with_new(s, ids, *self.first_sight(ids, z))
         points = np.arange(len(s.landmarks) - len(z), len(s.landmarks))
-        return replace(s, rows=s.rows.joined(self._rows(s, points, z)))
+        return changed(s, rows=s.rows.joined(self._rows(s, points, z)))
 
     def removed(self, s: WindowState, ids: IdArray) -> WindowState:
         """Without landmarks; what their measurements say of the poses stays.
@@ -112,7 +112,7 @@ class Steps(RectifiedMeasurement):
         """
         left = s.landmarks.ids.copy()
         left[s.landmarks.rows_of(ids)] = -1
-        return replace(s, landmarks=replace(s.landmarks, ids=left))
+        return changed(s, landmarks=changed(s.landmarks, ids=left))
 
     def inserted(self, s: WindowState, ids: IdArray, positions: Array, covariances: Array) -> WindowState:
         """With landmarks known in the world; see `slam.interfaces.MapBackend.insert`."""
@@ -128,7 +128,7 @@ class Steps(RectifiedMeasurement):
         """With landmarks known in the newest camera's coordinates; see `slam.interfaces.MapBackend.place`."""
         s = _with_new(s, ids, local, covariances, np.zeros((len(ids), 3, s.by_rig.shape[1])))
         points = np.arange(len(s.landmarks) - len(ids), len(s.landmarks))
-        return replace(s, places=s.places.joined(_places(s, points, local, covariances)))
+        return changed(s, places=s.places.joined(_places(s, points, local, covariances)))
 
     # --- parts of an update ---
 
@@ -160,11 +160,11 @@ class Steps(RectifiedMeasurement):
             before = s.rows
         poses = np.concatenate([s.poses[:-1], found.T[None]])
         limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.models.gate_probability)
-        s = replace(s, poses=poses, rows=before.joined(self._rows(s, points[used], z[used])))
-        w = replace(problem(s, self.stereo), asked=among(len(s.landmarks), points[used]))
+        s = changed(s, poses=poses, rows=before.joined(self._rows(s, points[used], z[used])))
+        w = changed(problem(s, self.stereo), asked=among(len(s.landmarks), points[used]))
         fresh = unknown_turn(s.covariance[-6:, -6:])
         for again in range(_SOLVED_AGAIN + 1):
-            solution = solve(replace(w, rows=s.rows), fresh=fresh)
+            solution = solve(w, fresh=fresh)
             covariances = solution.point_covariances(len(poses) - 1)
             its = covariances[0][points[used]]
             distances = solution.left_out_distances(-1, points[used], z[used], its, self.models.pixel_sigma, _TESTED)
@@ -174,8 +174,8 @@ class Steps(RectifiedMeasurement):
             used[np.flatnonzero(used)[bad]] = False
             if not used.any():
                 raise np.linalg.LinAlgError("no observation agrees with the others")
-            s = replace(s, rows=before.joined(self._rows(s, points[used], z[used])))
-            w = solution.window
+            s = changed(s, rows=before.joined(self._rows(s, points[used], z[used])))
+            w = changed(solution.window, rows=s.rows)
         nis = max(solution.cost - s.cost, 0.0) if found.jump is None else float("nan")
         s = _after(s, solution, covariances, solution.by_rig(self.field(s.rows.z)), points[used])
         return s, UpdateReport(UpdateStatus.OK, "", ids[used], ids[~used], nis, int(np.isfinite(z[used]).sum()))
@@ -198,7 +198,7 @@ def _seen_from_newest(s: WindowState, rows: IndexArray, by_motion: Array = _STIL
 
 
 def _with(s: WindowState, new: WindowLandmarks) -> WindowState:
-    return replace(s, landmarks=s.landmarks.joined(new), serials=s.serials + len(new))
+    return changed(s, landmarks=s.landmarks.joined(new), serials=s.serials + len(new))
 
 
 def _with_new(s: WindowState, ids: IdArray, local: Array, covariances: Array, by_rig: Array) -> WindowState:
@@ -208,7 +208,7 @@ def _with_new(s: WindowState, ids: IdArray, local: Array, covariances: Array, by
     by_pose = R @ points_by_pose(local)
     world = R @ covariances @ R.T + by_pose @ s.covariance[-6:, -6:] @ np.swapaxes(by_pose, 1, 2)
     turn = s.poses[s.solved][:3, :3].T @ R
-    return _with(replace(s, measured=True), WindowLandmarks(
+    return _with(changed(s, measured=True), WindowLandmarks(
         ids, s.serials + np.arange(n), local @ R.T + T[:3, 3], turn @ covariances @ turn.T,
         0.5 * (world + np.swapaxes(world, 1, 2)), np.full(n, int(s.frames[-1])), np.zeros((n, 3)), np.zeros((n, 3, 3)),
         R @ by_rig - by_pose @ s.by_rig[-6:],
@@ -233,15 +233,15 @@ def _begun_anew(s: WindowState, T: Array, P: Array) -> WindowState:
         s.frames[-1:], s.stamps[-1:], T[None], P, by_rig, begun=int(s.frames[-1]),
         turned=T[:3, :3] @ P[:3, :3] @ T[:3, :3].T,
         prior=RelativePrior.of_pose(T, P, by_rig), serials=s.serials, measured=s.measured, contradicted=s.contradicted,
-        landmarks=replace(s.landmarks, local=turn @ s.landmarks.local @ turn.T),
+        landmarks=changed(s.landmarks, local=turn @ s.landmarks.local @ turn.T),
     )  # fmt: skip
 
 
 def _restarted(s: WindowState, T: Array, points: IndexArray) -> WindowState:
     """A window of one pose T (4, 4), where the landmarks say; they are placed relative to it."""
-    local, own = _seen_from_newest(replace(s, poses=np.concatenate([s.poses[:-1], T[None]])), points)
+    local, own = _seen_from_newest(changed(s, poses=np.concatenate([s.poses[:-1], T[None]])), points)
     one = _begun_anew(s, T, world_covariance(s.covariance[-6:, -6:]))
-    return replace(one, places=_places(one, points, local, own))
+    return changed(one, places=_places(one, points, local, own))
 
 
 def _after(
@@ -251,15 +251,15 @@ def _after(
     """The state at a solution; landmarks that take no part become less certain with the motion since the last one."""
     marks, w, (local, world) = s.landmarks, solution.window, covariances
     part = (w.layout.place >= 0) | (np.diff(w.layout.first) > 0)
-    there = replace(s, poses=w.poses, covariance=solution.pose_covariance, by_rig=by_rig[0])
+    there = changed(s, poses=w.poses, covariance=solution.pose_covariance, by_rig=by_rig[0])
     known = part & (np.einsum("nii->ni", local) > 0).all(axis=1) & (np.einsum("nii->ni", world) > 0).all(axis=1)
     others, last = np.flatnonzero(~known & (marks.ids >= 0)), marks.last.copy()
     if len(others):
         local[others] = _seen_from_newest(there, others, there.relative(s.solved))[1]
         world[others] = marks.world[others]
     last[measured] = s.frames[-1]
-    marks = replace(
+    marks = changed(
         marks, position=w.points, local=local, world=world, last=last,
         by_rig=np.where(part[:, None, None], by_rig[1], marks.by_rig),
     )  # fmt: skip
-    return replace(there, cost=solution.cost, solved=len(s.frames) - 1, landmarks=marks)
+    return changed(there, cost=solution.cost, solved=len(s.frames) - 1, landmarks=marks)

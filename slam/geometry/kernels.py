@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam.kernels.linear import assign, squared_distance, trace, turn, whitener
-from slam.kernels.se3 import between, point_by_motion, transform_back
+from slam.kernels.se3 import adjoint, between, point_by_motion, transform_back
 from slam.kernels.stereo import offsets, residual
 from slam.runtime.compilation import helper, kernel
 
@@ -165,6 +165,31 @@ def seen(T, before, points, covariances, motion):
                 for k in range(6):
                     out[m, i, j] += GM[i, k] * G[j, k]
     return local, out
+
+
+@kernel
+def relative_covariance(P, at, to, earlier, later):
+    """Covariance (6, 6) of a pose `later` (4, 4) where another one, `earlier`, is known, both perturbed on the right.
+
+    Their unknowns begin at `to` and `at` in the joint covariance P.
+    """
+    M, A, W, out = np.empty((3, 4)), np.empty((6, 6)), np.empty((6, 12)), np.empty((6, 6))
+    between(later, earlier, M)
+    adjoint(M, A)
+    for i in range(6):
+        for j in range(6):
+            x, y = P[to + i, at + j], P[to + i, to + j]
+            for k in range(6):
+                x -= A[i, k] * P[at + k, at + j]
+                y -= A[i, k] * P[at + k, to + j]
+            W[i, j], W[i, 6 + j] = x, y
+    for i in range(6):
+        for j in range(i + 1):
+            total = W[i, 6 + j]
+            for k in range(6):
+                total -= W[i, k] * A[j, k]
+            out[i, j] = out[j, i] = total
+    return out
 
 
 @kernel

@@ -6,7 +6,7 @@ pose is brought close first, with the landmarks held where they are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray
 from slam.geometry import kernels
+from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array
 from slam.window import solver
 from slam.window.problem import RelativePrior, Rows, Window
@@ -22,6 +23,7 @@ from slam.window.stereo import RectifiedStereo
 
 _HUBER = 1.5  # whitened residual from which on a measurement's pull no longer grows
 _ROUNDS = 3  # numerics: of solving and gating
+_ANY = RelativePrior.of_pose(np.eye(4), np.eye(6))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,7 @@ class PoseProblem:
         """One free pose, at T (4, 4), with the prediction as prior, and known points."""
         n = len(self.points)
         rows = Rows(np.zeros(n, np.intp), np.arange(n), self.z, self.whiteners)
-        prior = replace(RelativePrior.of_pose(self.predicted, np.eye(6)), information=self.information)
+        prior = changed(_ANY, T=self.predicted, information=self.information)
         return Window(self.stereo, T[None], self.points, rows, known=np.ones(n, bool), prior=prior)
 
     @cached_property
@@ -72,7 +74,7 @@ def solve(problem: PoseProblem, start: Array) -> tuple[Array, BoolArray]:
     used = row_distances(w) <= limits
     for _ in range(_ROUNDS):
         counts = np.where(used[:, None, None], rows.root, 0.0)
-        w = solver.solve(w.at(w.poses, w.points, replace(rows, root=counts))).window
+        w = solver.solve(w.at(w.poses, w.points, changed(rows, root=counts))).window
         again = row_distances(w.at(w.poses, w.points, rows)) <= limits
         if (again == used).all():
             break

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,9 +29,10 @@ class Rows(Table):
     def of(cls, pose: IndexArray | int, point: IndexArray, z: Array, sigma: float) -> Rows:
         """Measurements with independent noise of each pixel, `sigma` [px], from one pose or from poses (M,)."""
         n = len(point)
-        return cls(np.full(n, pose), point, z, np.tile(np.eye(3) / sigma, (n, 1, 1)))
+        return cls(np.full(n, pose), point, z, np.repeat((np.eye(3) / sigma)[None], n, axis=0))
 
     @classmethod
+    @cache
     def none(cls) -> Rows:
         """No measurement."""
         return cls(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros((0, 3, 3)))
@@ -48,6 +49,7 @@ class Places(Table):
     root: Array  # square root of its information there (Q, 3, 3)
 
     @classmethod
+    @cache
     def none(cls) -> Places:
         """No such point."""
         none = np.zeros(0, np.intp)
@@ -75,6 +77,7 @@ class Motion:
         return tuple(vars(self).values())
 
     @classmethod
+    @cache
     def none(cls) -> Motion:
         """No motion model."""
         return cls(np.zeros((0, 3), np.intp), np.zeros((0, 2)), np.zeros((0, 6)), np.zeros((0, 6)))
@@ -125,6 +128,7 @@ class RelativePrior:
         return tuple(vars(self).values())[:-1]
 
     @classmethod
+    @cache
     def none(cls) -> RelativePrior:
         """Nothing is known."""
         none = np.zeros(0, np.intp), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.eye(4), np.zeros((0, 4, 4))

@@ -10,12 +10,13 @@ Then the prediction is probably wrong, not the observations. There are two cases
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray
+from slam.geometry.arrays import changed
 from slam.geometry.rig import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, log
 from slam.window import pose_only
@@ -64,7 +65,9 @@ def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, cont
 
 def unknown_turn(P: Array) -> bool:
     """Whether the orientation of a pose with covariance P (6, 6) is uncertain by more than a radian."""
-    return bool(np.linalg.eigvalsh(P[:3, :3]).max() > _RADIAN)
+    # the norm, which is no less than an eigenvalue, takes a tenth of the time
+    P = P[:3, :3]
+    return not (P * P).sum() <= _RADIAN**2 and bool(np.linalg.eigvalsh(P).max() > _RADIAN)
 
 
 def _seated(problem: pose_only.PoseProblem, there: Array) -> Agreement | None:
@@ -75,7 +78,7 @@ def _seated(problem: pose_only.PoseProblem, there: Array) -> Agreement | None:
     if x @ problem.information @ x > limit:
         jump = np.repeat([float(x[:3] @ x[:3]), float(x[3:] @ x[3:])], 3)
         wide = np.linalg.inv(problem.information) + np.diag(jump)
-        problem = replace(problem, information=np.linalg.inv(wide))
+        problem = changed(problem, information=np.linalg.inv(wide))
     T, used = pose_only.solve(problem, there)
     return Agreement(T, used, jump) if used.sum() >= max(MIN_CONSENSUS, (len(used) + 1) // 2) else None
 

@@ -14,9 +14,10 @@ import numpy as np
 
 from slam.data import IdArray, IndexArray, Observations
 from slam.errors import MeasurementError
+from slam.geometry import kernels
 from slam.geometry.kernels import predicted_pixels, project_rectified, triangulate_rectified
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, adjoint, inverse
+from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 
 #: Why a back end refuses `slam.interfaces.ConsideringBackend.consider`.
@@ -135,15 +136,14 @@ class RectifiedMeasurement:
         return predicted_pixels(camera, local, covariances, self.models.pixel_sigma, _MOST_CORRELATED)
 
 
-def relative_covariance(P: Array, earlier: Array, later: Array) -> Array:
-    """Covariance (6, 6) of a pose where another one is known, from their joint covariance (12, 12).
+def relative_covariance(P: Array, earlier: Array, later: Array, at: int = 0) -> Array:
+    """Covariance (6, 6) of a pose where another one is known, from a joint covariance (n, n).
 
     Args:
-        P: of the pose that is known, then the other, both perturbed on the right.
+        P: of poses, perturbed on the right; the last is the other.
         earlier: the pose that is known (4, 4).
         later: the other (4, 4).
+        at: where the one that is known begins in P.
     """
-    A = adjoint(inverse(later) @ earlier)
-    cross = A @ P[:6, 6:]
-    C = P[6:, 6:] + A @ P[:6, :6] @ A.T - cross - cross.T
-    return np.asarray(0.5 * (C + C.T))
+    P = np.ascontiguousarray(P)
+    return np.asarray(kernels.relative_covariance(P, at, len(P) - 6, earlier, later))
