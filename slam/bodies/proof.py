@@ -12,6 +12,8 @@ Members also share errors of which nothing is known: that of a junction of two e
 which slides along both as the camera moves, with all features around it. Therefore the body's places in the frames of
 the window, or those of its ends, must lie along a way better than they scatter about it (an F test): such a junction
 jumps, and a body goes on. Nor does it turn: how surely the members turn, as a whole, counts as much as the way does.
+What the way has in common with that of the camera says nothing: where an edge crosses the picture of one farther off,
+or a match is wrong by a constant disparity, the place goes a share of the camera's way.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ class Way:
     places: Array  # of its middle and ends in some of them (K, 4, 3), in the world or in its whole [m]
     times: Array  # of these frames (K,) [s]
     by_rig: Array  # how far it seems to go in a frame by a disparity that is wrong by the deviation of a pixel (3,) [m]
-    of_camera: float  # how far the camera went in these frames [m]
+    cameras: Array  # where the camera was in these frames (K, 3) [m]
 
     @classmethod
     def of(cls, body: Body, frame: Frame, whole: Body | None) -> Way:
@@ -63,14 +65,23 @@ class Way:
         rays = places[:, 0] - cameras[seen, :3, 3]
         depth = np.einsum("ni,ni->n", rays, cameras[seen, :3, 2])
         off = rays * (frame.setup.depth_noise(depth) / depth)[:, None]  # by a disparity that is wrong by sigma
-        camera = float(np.linalg.norm(np.ptp(cameras[seen, :3, 3], axis=0)))
         by_rig = (off[-1] - off[0]) / max(len(seen) - 1, 1)
-        return cls(places, stamps[seen], by_rig, camera)
+        return cls(places, stamps[seen], by_rig, cameras[seen, :3, 3])
 
     @property
     def far(self) -> bool:
         """Whether it is longer than that of the camera by far: what slides does not go so far."""
-        return float(np.linalg.norm(np.ptp(self.places, axis=0), axis=1).max()) > _FARTHER * self.of_camera
+        went = np.linalg.norm(np.ptp(self.places, axis=0), axis=1).max()
+        return bool(went > _FARTHER * np.linalg.norm(np.ptp(self.cameras, axis=0)))
+
+    def beside_camera(self) -> Array:
+        """The places (K, 4, 3) less the share of the camera's way, 0 to 1, that is most like the way of their middle.
+
+        What is seen at a wrong depth z instead of Z seems to go the share 1 − z/Z of the camera's way, as evenly.
+        """
+        camera = (self.cameras - self.cameras.mean(axis=0))[:, None]
+        share = (self.places[:, :1] * camera).sum() / max(float((camera**2).sum()), _WEAK)
+        return np.asarray(self.places - np.clip(share, 0.0, 1.0) * camera)
 
 
 def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, int]:
@@ -79,7 +90,8 @@ def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, fa
     The evidence is a cumulative sum of −log10 of the chance that the weaker test gives; it fades while a body rests.
     For a body that was followed `far`, for farther than it is wide, its way alone counts.
     """
-    says, turns, enough = _by_frames(way), 0.0, len(moved.d) >= MIN_POINTS
+    places = way.places if far else way.beside_camera()
+    says, turns, enough = _by_frames(places, way.times), 0.0, len(moved.d) >= MIN_POINTS
     if enough and not far:
         by_members, turns = _by_members(moved, scene, way.by_rig)
         says = min(says, by_members)
@@ -112,14 +124,14 @@ def _by_members(moved: Displacements, scene: Scene, by_rig: Array) -> tuple[floa
     return _evidence(float(chdtrc(6, motion_test))), _evidence(float(chdtrc(3, turn)))
 
 
-def _by_frames(way: Way) -> float:
+def _by_frames(places: Array, times: Array) -> float:
     """What its way says: −log10 of the chance of so long a one, even or evenly accelerated, by its scatter about it."""
-    n = len(way.places)
+    n = len(places)
     if n < MIN_POINTS:
         return 0.0
-    t = way.times - way.times.mean()
+    t = times - times.mean()
     basis, _ = np.linalg.qr(np.stack([np.ones(n), t, t * t], axis=1))
-    offset = way.places - way.places.mean(axis=0)
+    offset = places - places.mean(axis=0)
     squares = np.array([(offset[:, :k] ** 2).sum() for k in (1, len(_ENDS))])  # of the middle, and of all
     ways = [((basis[:, 1:].T @ offset[:, :k].reshape(n, -1)) ** 2).sum() for k in (1, len(_ENDS))]
     ratio = np.max(ways / (np.maximum(squares - ways, 0.0) + _WEAK))

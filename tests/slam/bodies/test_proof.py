@@ -37,7 +37,7 @@ def way(motion: np.ndarray, jumps: float, rng: np.random.Generator, by_rig: np.n
     poses = exp(frames[:, None] * np.concatenate([motion[:3], np.zeros(3)]))
     poses[:, :3, 3] = frames[:, None] * motion[3:] + jumps * rng.standard_normal((WINDOW, 3))
     places = (poses[:, None, :3, :3] @ ENDS[:, :, None])[..., 0] + poses[:, None, :3, 3]
-    return Way(places, 0.1 * frames, by_rig, 0.0)
+    return Way(places, 0.1 * frames, by_rig, np.zeros((WINDOW, 3)))
 
 
 def result(
@@ -88,8 +88,20 @@ def test_what_goes_farther_than_the_camera_does_not_slide_with_it():
     """So less is asked of it; the camera's way is the only difference."""
     rng = np.random.default_rng(1)
     moved, jumpy = group(10, 0.05 * ASIDE, 0.01, rng), way(0.05 * ASIDE, 0.03, rng)
-    proven = [with_frame(0.0, moved, scene(), replace(jumpy, of_camera=far), False)[1] for far in (0.1, 3.0)]
+    upwards = np.linspace(0, 1, WINDOW)[:, None] * [0, 1.0, 0]
+    proven = [with_frame(0.0, moved, scene(), replace(jumpy, cameras=far * upwards), False)[1] for far in (0.1, 3.0)]
     assert proven == [2, 0]
+
+
+@pytest.mark.parametrize(("share", "across", "certain"), [(0.6, 0.0, 0), (1.0, 0.0, 0), (0.6, 0.05, 2), (1.8, 0.0, 2)])
+def test_what_goes_a_share_of_the_cameras_way_may_stand_still(share, across, certain):
+    """As a crossing of edges at two depths does; a body goes across that way, or farther."""
+    rng = np.random.default_rng(1)
+    frames = np.arange(WINDOW)[:, None]
+    cameras = 0.05 * frames * [1.0, 0.2, 0] + 0.002 * frames**2 * [0, 0, 1.0]
+    middle = share * cameras + across * frames * [0, 0, 1.0] + 1e-3 * rng.standard_normal((WINDOW, 3))
+    went = Way(middle[:, None] + ENDS, 0.1 * frames[:, 0], NONE, cameras)
+    assert with_frame(0.0, group(10, 0.05 * ASIDE, 0.01, rng), scene(), went, False)[1] == certain
 
 
 def test_the_common_motion_of_the_scene_is_none_of_the_bodys():
