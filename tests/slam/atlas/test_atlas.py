@@ -82,7 +82,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory):
 def system_for(sequence, backend: object, settings: tuple[str, ...] = ()) -> slam.StereoSlam:
     config = SystemConfig.for_kind(sequence.kind, None).with_settings(
         ["map.target_in_view=40", "map.max_landmarks=100", "objects.mode=off", "self_calibration.enabled=false",
-         *settings]
+         "models.slide.density=0", *settings]  # these features do not slide
     )  # fmt: skip
     return slam.StereoSlam(sequence.rig, None, backend, config=config)  # type: ignore[arg-type]
 
