@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam.errors import CalibrationError
-from slam.geometry.camera import PinholeCamera, baseline_doubt, floats, size_doubt
+from slam.geometry.camera import PinholeCamera, floats, size_doubt
 from slam.geometry.se3 import Array, nearest_rotation
 
 _ZERO_DISPARITY = 1024  # fixed: OpenCV's CALIB_ZERO_DISPARITY, whose module differs between its versions
@@ -161,10 +160,7 @@ class StereoRig:
         if rotation.shape != (3, 3) or offset.shape != (3,):
             raise CalibrationError("stereo extrinsics must be a (3, 3) rotation and a (3,) translation")
         with np.errstate(all="ignore"):  # what is not finite is refused right away
-            rig = cls(left, right, rotation, rotation.T @ offset)
-        if doubt := baseline_doubt(rig.baseline):
-            logging.getLogger(__name__).warning("%s", doubt)
-        return rig
+            return cls(left, right, rotation, rotation.T @ offset)
 
     @cached_property
     def baseline(self) -> float:

@@ -79,11 +79,14 @@ def calibrate(
     corrected = corrected_rig(model, kept.posterior.mean)
     pairs, unsolved = (sum(one[key] for one in recordings) for key in ("pairs", "unsolved_pairs"))
     warning, judgement, worth = "" if pairs else _NO_PAIRS, "", False
+    doubt = next((f"{one['sequence']}: {one['doubt']}" for one in recordings if one["doubt"]), "")
     if unsolved > pairs:
         warning = (
             f"{unsolved} of {pairs + unsolved} pairs of views agree on no motion: is the calibration of these cameras, "
             "and of images of this size?"
         )
+    elif doubt:  # what is held back by what good calibrations are off by is no correction
+        warning = doubt
     else:
         matched = float(np.median([one["matched"] for one in recordings]))
         judgement, worth = _judged(model, kept.posterior, configs[0].models.pixel_sigma, matched, apart)
@@ -120,6 +123,7 @@ def _run(
         "matched": float(np.median(matched)) if matched else 0.0,  # landmarks found again in a frame
         "pairs": own.pairs,
         "unsolved_pairs": own.unsolved,
+        "doubt": own.doubt,
     }
     return found | own.kept().posterior.to_json(), own.evidence()
 

@@ -178,20 +178,30 @@ def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) 
     )
 
 
-def row_flow(features: StereoFeatures, T_other_now: Array, rig: StereoRig) -> Array:
-    """Sums of products (7, 7) over a frame's features [px²]: of vertical disparities, of the flow, and of `_fields`.
+def row_points(features: StereoFeatures, rig: StereoRig) -> Array:
+    """Of each feature with a right pixel (N, 5): its point in the rectified left camera's axes [m], row, and disparity.
+
+    The row [px] is that in the rectified left image, the disparity [px] the vertical one. Not a number where the rays
+    do not meet.
+    """
+    rows, rectified = np.flatnonzero(features.has_stereo), rig.rectified
+    left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
+    with np.errstate(all="ignore"):
+        points = rectified.rig.triangulate(left, np.column_stack([right[:, 0], left[:, 1]]))
+    return np.column_stack([points, left[:, 1], right[:, 1] - left[:, 1]])
+
+
+def row_flow(seen: Array, T_other_now: Array, rig: StereoRig) -> Array:
+    """Sums of products (7, 7) over `row_points` [px²]: of vertical disparities, of the flow, and of `_fields`.
 
     The flow is how many rows a still point moves in the left image from another frame to this one; `T_other_now` (4, 4)
     takes this frame's camera coordinates to the other's. A right image from between them is off by a share of it.
     """
-    rows, rectified, R = np.flatnonzero(features.has_stereo), rig.rectified, rig.rectified.R_left
-    left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
-    camera = rectified.rig.left
+    points, R, camera = seen[:, :3], rig.rectified.R_left, rig.rectified.rig.left
     with np.errstate(all="ignore"):
-        points = rectified.rig.triangulate(left, np.column_stack([right[:, 0], left[:, 1]]))
         there = (points @ R @ T_other_now[:3, :3].T + T_other_now[:3, 3]) @ R.T
-        flow = left[:, 1] - camera.project(there)[:, 1]
-        columns = np.column_stack([right[:, 1] - left[:, 1], flow, *_fields(points)])
+        flow = seen[:, 3] - camera.project(there)[:, 1]
+        columns = np.column_stack([seen[:, 4], flow, *_fields(points)])
     columns = columns[np.isfinite(columns).all(axis=1) & (np.abs(flow) < _FLOW)]
     return np.asarray(columns.T @ columns)
 

@@ -17,13 +17,13 @@ from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError, one_line, text_of
 from slam.evaluation.objects import labels_in_images, score_for
 from slam.evaluation.summary import with_truth
-from slam.geometry.se3 import inverse
+from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.input.features import Rectification
 from slam.interfaces import Frontend
 from slam.outputs import require_outputs
 from slam.run.options import RunOptions, origin, versions
-from slam.run.outcome import median_depth, moment_doubt, motion_doubt, outcome, row_flow, scale_doubt
+from slam.run.outcome import median_depth, moment_doubt, motion_doubt, outcome, row_flow, row_points, scale_doubt
 from slam.run.outputs import RunFiles, write_json, write_trajectory
 from slam.run.recording import RecordedFrame, Recording, save_recording
 from slam.run.replay import replay
@@ -145,7 +145,7 @@ class _Run:
                 reading[frame.index] = 1e3 * (time.perf_counter() - start) if self.live is None else 0.0
                 yield frame
 
-        before: FrameResult | None = None
+        before: tuple[FrameResult, Array] | None = None
         for frame, result in system.run(timed()):
             result.milliseconds["read"] = reading.pop(frame.index)  # type: ignore[index]
             if self.live is not None:
@@ -153,11 +153,11 @@ class _Run:
             if frame.right is None:
                 record.without_right.append(len(record.statuses))
             record.depths.append(median_depth(result.features, system.rig))
-            if result.status.measured and before is not None and before.status.measured:
-                step = inverse(before.estimate.T_world_left) @ result.estimate.T_world_left
-                late = row_flow(result.features, step, system.rig)
-                record.row_flows.append((late, row_flow(before.features, inverse(step), system.rig)))
-            before = result
+            seen, rig = row_points(result.features, system.rig), system.rig
+            if result.status.measured and before is not None and before[0].status.measured:
+                step = inverse(before[0].estimate.T_world_left) @ result.estimate.T_world_left
+                record.row_flows.append((row_flow(seen, step, rig), row_flow(before[1], inverse(step), rig)))
+            before = result, seen
             yield frame.index, result
             for watch in watches:
                 watch(frame, result, system)

@@ -377,30 +377,6 @@ def test_the_iterated_update_is_the_maximum_of_the_posterior(guess, spread, monk
     assert w @ w == pytest.approx(2 * best.cost, rel=1e-3)  # νᵀS⁻¹ν there is the least cost
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_a_transported_covariance_does_not_change_the_maximum(seed, monkeypatch):
-    """Inverse depths move by a fifth: an error of the pose displaces landmarks from where they are by now."""
-    monkeypatch.setattr("backends.ekf.solve._LINEAR", 1e-3)
-    rng, coordinates, found = np.random.default_rng(seed), InverseDepth(), []
-    points, sigmas = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (15, 3)), np.repeat([0.3, 0.1, 0.1], [3, 3, 6])
-    anchors = np.tile(np.eye(3, 4), (15, 1, 1))
-    true = coordinates.of(anchors, points)
-    off = np.stack([np.full(15, 1e-3), np.full(15, 1e-3), 0.2 * true[:, 2]], axis=1)
-    known = true + off * rng.standard_normal((15, 3)).clip(-2, 2)
-    error, noise = sigmas * rng.standard_normal(12), 0.5 * rng.standard_normal((15, 3))
-    for transports in (True, False):
-        s = FilterState.first(*EulerCamera.first(MODELS, transports))
-        truth = s.camera.moved(error).pose
-        z = RIG.project_stereo(se3.transform(se3.inverse(truth), points))[0] + noise
-        marks = FilterLandmarks.at(coordinates, np.arange(15), anchors, coordinates.points(anchors, known), 0)
-        P = covariance_of(np.diag(np.concatenate([sigmas, off.ravel()]) ** 2))
-        s = replace(s, landmarks=marks, covariance=P)
-        gated = gate(update_of(s, z, coordinates, 50, 1 - 1e-15))
-        found.append(s.corrected(solve(replace(gated, limits=np.full(15, 1e9)))))
-    between = se3.log(se3.inverse(found[0].pose) @ found[1].pose)
-    assert between @ np.linalg.solve(found[1].pose_covariance(), between) < 0.3**2
-
-
 @pytest.mark.parametrize("guess", [False, True])
 def test_a_step_that_lowers_no_cost_is_no_information(guess, monkeypatch):
     """Where the mean does not move towards the measurements, the variance must not fall either."""

@@ -129,10 +129,3 @@ def test_the_scale_of_rectified_pixels():
     assert not rig.is_rectified
     assert rig.rectified.scale == pytest.approx(rig.rectified.rig.left.fu / 300.0)
     assert StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.1, 320, 240).rectified.scale == 1.0
-
-
-def test_a_baseline_in_millimetres_is_doubted_where_it_is_given(caplog):
-    K = [[300, 0, 159.5], [0, 300, 119.5], [0, 0, 1]]
-    assert StereoRig.from_pinhole(K, baseline=0.12, size=(320, 240)).baseline == 0.12 and not caplog.records
-    StereoRig.from_pinhole(K, baseline=120, size=(320, 240))
-    assert "the cameras are 120 m apart" in caplog.text and "unit=mm makes 0.12 m" in caplog.text

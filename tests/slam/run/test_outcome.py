@@ -14,7 +14,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp, inverse
 from slam.models import MotionModel
 from slam.outputs import Output
-from slam.run.outcome import moment_doubt, motion_doubt, outcome, row_flow, scale_doubt
+from slam.run.outcome import moment_doubt, motion_doubt, outcome, row_flow, row_points, scale_doubt
 from slam.run.results import rows
 from slam.run.summary import RunRecord
 
@@ -152,8 +152,8 @@ def test_right_images_of_another_moment_are_known_by_rows_that_follow_the_motion
         after = exp(rng.normal(0, 1, 6) * [0.006, 0.006, 0.006, 0.01, 0.01, 0.01])
         there = points @ (step if late > 0 else after)[:3, :3].T + (step if late > 0 else after)[:3, 3]
         right[:, 1] += abs(late) * (RIG.left.project(there) - left)[:, 1] + 0.4 + rng.normal(0, 0.1, len(points))
-        features = features_at(left, right)
-        run.row_flows.append((row_flow(features, step, RIG), row_flow(features, after, RIG)))
+        seen = row_points(features_at(left, right), RIG)
+        run.row_flows.append((row_flow(seen, step, RIG), row_flow(seen, after, RIG)))
     said = moment_doubt(run)
     assert bool(said) == bool(word) and f"right images were {word} by" in (said or "right images were  by")
 
@@ -168,8 +168,8 @@ def test_rows_that_differ_by_the_calibration_are_no_lag_where_the_motion_is_alwa
         there = RIG.left.project(points @ step[:3, :3].T + step[:3, 3])
         x, y = (left - [RIG.left.u0, RIG.left.v0]).T / RIG.left.fu
         right[:, 1] += late * (there - left)[:, 1] + 1.0 + 3.0 * x - 4.0 * y + 2.0 * x * y + rng.normal(0, 0.1, len(x))
-        features = features_at(left, right)
-        run.row_flows.append((row_flow(features, step, RIG), row_flow(features, inverse(step), RIG)))
+        seen = row_points(features_at(left, right), RIG)
+        run.row_flows.append((row_flow(seen, step, RIG), row_flow(seen, inverse(step), RIG)))
     assert ("late by" in moment_doubt(run)) if late else moment_doubt(run) == ""
 
 
