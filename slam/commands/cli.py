@@ -249,13 +249,12 @@ def compare_command(
     sequences: Annotated[list[str], argument("Folders, or synthetic:NAME?key=value.", "SEQUENCE")],
     out: Annotated[Path, option("Folder; a comparison that was stopped in it goes on.", "DIR", "--out", "-o")],
     backends: Annotated[str, option("Back ends; the first is the reference.", "A,B,...")] = ",".join(ONLINE),
-    frontends: Annotated[str, option("Front ends; simulated: a world's own features, no images.", "A,B,...")] = "",
-    variant: Annotated[list[str] | None, option("A front end, NAME:FRONTEND:KEY=VALUE:...", "VARIANT")] = None,
+    frontend: Annotated[str, option("Front end; simulated: a world's own features, no images.", "NAME")] = "surf",
     settings: _Set = None,
     mask: _Mask = None,
     trials: Annotated[int, option("Seeds 0 to N - 1 of every synthetic world.", "N", min=1)] = 12,
     frames: _Frames = None,
-    replay: Annotated[bool, option("Also feed the first back end's measurements to all.")] = True,
+    replay: Annotated[bool, option("Also feed the first back end's measurements to all.", None, "--replay")] = False,
     workers: Annotated[int | None, option("Processes; default: the number of cores.", "N")] = None,
     overwrite: _Overwrite = False,
     quiet: Annotated[bool, option("No progress, no conclusions.", None, "--quiet", "-q")] = False,
@@ -267,10 +266,9 @@ def compare_command(
     from slam.run.options import parse_frames
     from slam.sequences import with_mask
 
-    sequences = [with_mask(text, mask) for text in sequences]
-    names = [[word for word in text.split(",") if word] for text in (backends, frontends)]
-    variants = command.variants_of(names[1], variant or [], settings or [])
-    plan = Plan(tuple(sequences), tuple(names[0]), variants, trials, *parse_frames(frames), replay)
+    masked, names = (with_mask(text, mask) for text in sequences), filter(None, backends.split(","))
+    start, stop = parse_frames(frames)
+    plan = Plan(tuple(masked), tuple(names), frontend, tuple(settings or ()), trials, start, stop, replay)
     with leaving("trials done so far are kept: the same command continues"):
         command.compare(plan, out, workers, quiet, overwrite, command_line())
 

@@ -60,10 +60,14 @@ def number(value: float, like: float | None = None) -> str:
     return text.replace("-", "−")
 
 
+#: Whether a run's path cannot be trusted.
+DOUBTED = "doubted"
+
 #: In the order of all tables. Times are not compared: they differ from run to run.
 METRICS = (
     Metric("completed", "runs completed", "%", "", "higher", "compared main"),
     Metric("tracked", "frames tracked", "%", "", "higher", "compared main"),
+    Metric(DOUBTED, "runs not to be trusted", "%", "", "lower", "compared main"),
     Metric("path_m", "path length", "m", "path_length_m", shown="run picture"),
     Metric("speed", "speed, median", "m/s", "speed_m_per_s", shown="run picture"),
     Metric("landmarks", "landmarks in the map at the end", "", "landmarks", shown="run"),
@@ -141,6 +145,7 @@ def figures(summary: Mapping[str, Any]) -> dict[str, float]:
         found["scale_error_percent"] = abs(found["scale_error_percent"])
     if frames := summary.get("frames", 0):
         found["tracked"] = _measured(summary) / frames
+    found[DOUBTED] = float(bool(summary.get("doubt")))
     if ratios := _ratios(found):
         found["ratio"] = next(iter(ratios.values()))
     if not (summary.get("status") or {}).get("tracked"):  # loops of poses that are the motion model's are none

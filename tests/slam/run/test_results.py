@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from slam.compare.plan import Plan, Trial, Variant
+from slam.compare.plan import Plan, Trial
 from slam.compare.sweep import Run
 from slam.compare.tables import groups, honesty
 from slam.run.results import figures, rows, verdict, verdict_of_run
@@ -44,8 +44,7 @@ def test_frames_that_are_not_judged_are_counted_beside_the_verdict():
 
 
 def test_covariances_that_are_too_large_on_an_exact_world_say_why(tmp_path):
-    plan = Plan(("synthetic:desk",), ("ekf",), replay=False)
-    trial = Trial("synthetic:desk", Variant("surf"), "ekf", 0, "closed loop")
+    plan, trial = Plan(("synthetic:desk",), ("ekf",)), Trial("synthetic:desk", "ekf")
     for exact in (True, False):
         tree = summary(0.1)
         tree["consistency"]["exact calibration"] = exact
