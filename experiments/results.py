@@ -151,10 +151,6 @@ EXPERIMENTS = (
         {"startup": "Left and middle: from three wrong starts to the true place in one frame. Right: the error then."},
     ),
     Experiment(
-        "walking_robot", "papers", "Walking robot (B, 4.3, Fig. 8)",
-        "Map and states in 3D; no ground truth, no figures.", {"errors": ERRORS},
-    ),
-    Experiment(
         "moving_objects", "objects", "Moving box, moving objects (B, 4.4, Table 1, Fig. 10)",
         "A box at four places by three features; Table 1 prints roll, pitch, yaw and translation, no ground truth.",
         {"box": "Error of the box's pose while it moves and rests, body frames aligned once."},

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
-from slam.errors import ConfigurationError, SequenceError, SlamError, UnknownNameError
-from slam.files import expanded, note_input, read_object, reason
+from slam.errors import ConfigurationError, SequenceError, UnknownNameError
+from slam.files import expanded, note_input, reason
 from slam.naming import nearest, unknown
 from slam.sequences import euroc, folders, kitti, ros
 from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, read_masks, say, turned
@@ -172,7 +172,7 @@ def _format_asked(folder: Path, query: str, text: str) -> str | None:
         raise SequenceError(f"{folder}: there is no such {what}{_hint_name(folder, text)}")
     if not folder.is_dir() and "layout" not in named:
         ending = folder.suffix.lower()
-        hint = f"; {_HINTS[ending]}" if ending in _HINTS else _hint_run(folder.parent)
+        hint = f"; {_HINTS[ending]}" if ending in _HINTS else ""
         if ending in VIDEO_SUFFIXES:
             two = f"two are {folder.parent}?left=…&right=…"
             hint = f"; a video with both images side by side is {folder}?layout=sbs, {two}"
@@ -194,19 +194,8 @@ def _hint_name(folder: Path, text: str) -> str:
     return "" if there == folder.parent else f": {there} has no {folder.relative_to(there).parts[0]!r}"
 
 
-def _hint_run(folder: Path) -> str:
-    """What a folder that a run left was a run of, and what shows it."""
-    with suppress(SlamError):
-        if (folder / "frames.csv").is_file():
-            source = read_object(folder / "config.json").get("source") or "something"
-            return f"; it is what a run of {source} left: give that, or look at the run with `slam view {folder}`"
-    return ""
-
-
 def _hint_near(folder: Path) -> str:
     """Which sequences lie below a folder, or it is a part of; else how to name the two cameras in it."""
-    if run := _hint_run(folder):
-        return run
     with suppress(OSError, SequenceError):
         for level in range(1, _LEVELS + 1):  # 2011_09_26/…_sync, dataset/sequences/03
             inside = islice(folder.glob("/".join("*" * level)), _LOOKED_AT)

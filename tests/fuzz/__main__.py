@@ -8,13 +8,11 @@ import sys
 import time
 from collections import Counter
 
-from tests.fuzz import agreement, bookkeeping, commands, library, readers, runs, saved, settings
+from tests.fuzz import agreement, bookkeeping, readers, saved, settings
 from tests.fuzz.harness import Failure, run_case, warm_up
 
 SUBJECTS = tuple(
-    subject
-    for module in (readers, settings, saved, commands, runs, library, agreement, bookkeeping)
-    for subject in module.SUBJECTS
+    subject for module in (readers, settings, saved, agreement, bookkeeping) for subject in module.SUBJECTS
 )
 
 

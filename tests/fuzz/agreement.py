@@ -16,7 +16,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import pose
 from slam.models import EstimatorModels, MotionModel
 from tests.fuzz.harness import Broken, Subject
-from tests.fuzz.hostile import choose
+from tests.fuzz.mutations import choose
 from tests.fuzz.reference import Array, Reference, difference
 
 RIG = StereoRig.rectified_pair(400, 319.5, 239.5, 0.3, 640, 480)

@@ -16,7 +16,7 @@ from slam.errors import SlamError
 from slam.system import StereoSlam
 from slam.tracks.config import MapConfig
 from tests.fuzz.harness import Broken, Subject, require_line
-from tests.fuzz.hostile import choose
+from tests.fuzz.mutations import choose
 from tests.slam.test_interrupted import Lines
 
 _WORLDS = ("synthetic:desk?frames=60&density=6&seed=1", "synthetic:box?frames=90&density=300")

@@ -17,7 +17,7 @@ from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.system import StereoSlam
 from tests.fuzz.harness import Subject
-from tests.fuzz.hostile import NUMBERS, choose
+from tests.fuzz.mutations import NUMBERS, choose
 
 FRAMES = 4
 

@@ -10,7 +10,6 @@ import slam
 from slam.calibration import RigModel, RigPosterior
 from slam.calibration.corrected import corrected_rig
 from slam.errors import SlamError
-from slam.run import calibrating
 from slam.run.calibrating import _judged
 from slam.run.options import load
 from tests.scripts import command
@@ -70,26 +69,6 @@ def test_a_correction_is_advised_only_where_it_is_expected_to_help(off, sigma, a
     words, worth = _judged(model, posterior, 0.4, 100.0, differing)
     assert worth == (word in ("This is worth correcting", "This is bad"))  # only then it is said how to use it
     assert f"{off:.2f} ± {sigma:.2f} px in disparity" in words and word in words
-
-
-@pytest.mark.parametrize(
-    ("pairs", "unsolved", "doubt", "words"),
-    [(12, 21, "", "21 of 33 pairs of views"), (12, 11, "", ""), (12, 1, "left out", f"{WORLD[10:]}: left out")],
-)
-def test_what_no_correction_mends_is_said(pairs, unsolved, doubt, words, tmp_path, monkeypatch):
-    """With 12 others, 21 pairs were told as "21 pairs; 12 do"; of a lens that was left out nothing was said."""
-    run = calibrating._run
-
-    def counted(*given):
-        found, evidence = run(*given)
-        return found | {"pairs": pairs, "unsolved_pairs": unsolved, "doubt": doubt}, evidence
-
-    monkeypatch.setattr(calibrating, "_run", counted)
-    printed = command("calibrate", WORLD, "--out", tmp_path / "rig.json")
-    warnings = json.loads((tmp_path / "rig.json").read_text())["warnings"]
-    assert json.loads((tmp_path / "rig.json").read_text())["worth_correcting"] is False or not doubt
-    assert [warning.partition(" agree")[0] for warning in warnings] == ([words] if words else [])
-    assert f"{pairs} pairs of views; in {unsolved} others too few features agree" in " ".join(printed.split())
 
 
 def test_it_is_the_prior_of_a_run_and_of_its_repetition(made, tmp_path):

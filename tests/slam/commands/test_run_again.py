@@ -101,13 +101,3 @@ def test_a_bad_config_is_one_line(tmp_path, text, words):
         command("run", WORLD, "--config", tmp_path, "--kind", "driving")
     with pytest.raises(SlamError, match="name a sequence"):
         command("run")
-
-
-def test_another_run_is_not_overwritten_without_being_told(here):
-    run(WORLD, "--frames", "0:2", "--out", "mine")
-    for words in ([WORLD, "--frames", "0:3"], ["--config", "mine"]):
-        with pytest.raises(SlamError, match=r"config\.json: is (there already|an input)"):
-            run(*words, "--out", "mine")
-    assert json.loads((here / "mine/config.json").read_text())["frames"] == [0, 2]
-    run(WORLD, "--frames", "0:3", "-o", "mine", "--overwrite")
-    assert json.loads((here / "mine/config.json").read_text())["frames"] == [0, 3]

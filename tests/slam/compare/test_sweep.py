@@ -94,15 +94,6 @@ def test_a_defect_is_an_outcome_and_a_worker_that_is_killed_ends_it_with_what_is
     assert outcomes == {"smoother": "completed", "iekf": "failed: ZeroDivisionError: a defect"}
 
 
-def test_an_interrupt_ends_the_workers(tmp_path):
-    def interrupt(trial):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        swept(tmp_path, 2, interrupt)
-    assert not multiprocessing.active_children()
-
-
 def test_what_is_done_is_not_done_again_and_what_is_not_is(done, again):
     kept, lost, damaged = (again / RUNS / trial.folder for trial in PLAN.every[:3])
     (kept / "marker").touch()
@@ -126,14 +117,6 @@ def test_a_failed_run_is_counted_never_dropped(again):
     assert "1 of 8 runs failed" in text
     assert "ValueError: no way" in text
     assert (again / "runs.csv").read_text().count("failed: ValueError: no way") == 1
-
-
-def test_bad_input_of_a_trial_is_an_outcome(tmp_path):
-    trial = next(replace(PLAN, trials=1, start=7, stop=9).trials_of(REPLAY))
-    run_trial(trial, tmp_path / "one")
-    result = json.loads((tmp_path / "one" / "result.json").read_text())
-    assert result["outcome"].startswith("failed: SlamError")
-    assert result["metrics"] == {"completed": 0.0}
 
 
 def test_a_folder_with_other_runs_is_left_alone(again):

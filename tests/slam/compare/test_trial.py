@@ -86,12 +86,6 @@ def test_a_run_knows_the_kind_of_motion_of_its_sequence(mode, tmp_path, monkeypa
     assert kinds == ["driving"]
 
 
-def test_nothing_tracked_gives_no_accuracy_and_is_no_fault():
-    found = measured({k: FrameStatus.FAILED for k in range(N)})
-    assert found["tracked"] == 0
-    assert not {"ate_online_m", "nees_per_dof", "rpe_1s_m"} & set(found)
-
-
 def test_what_was_run_with_other_settings_or_frames_is_not_done(tmp_path):
     """It lies there where a comparison that replaces another one was interrupted."""
     trial = Trial("synthetic:desk?frames=5", "ekf", settings=("frontend.features=100",))

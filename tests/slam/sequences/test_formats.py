@@ -73,15 +73,6 @@ def test_single_frames_of_recordings_and_worlds(kitti: Path, build: SimpleNamesp
         open_sequence(kitti)[1]
 
 
-def test_names_of_folders(kitti: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", str(kitti.parent))
-    monkeypatch.setenv("USERPROFILE", str(kitti.parent))
-    assert len(open_sequence("~/03")) == 6
-    odd = kitti.rename(kitti.parent / "what?")
-    assert open_sequence(odd).name == "what?"
-    assert open_sequence(f"{odd}?kind=handheld").kind == "handheld"
-
-
 # ------------------------------------------------------------------------------------------------ EuRoC
 
 
@@ -185,34 +176,6 @@ def test_kitti_part_of_a_sequence_keeps_its_times_and_poses(kitti: Path) -> None
     sequence = open_sequence(kitti)
     assert np.allclose(sequence.stamps, [0.2, 0.3, 0.4])
     assert sequence.warnings == [f"{kitti / 'image_0'}: no times, 10 frames per second assumed (see fps=…)"]
-
-
-@pytest.mark.parametrize(("name", "first"), [("frame_{:06d}", 0.0), ("{:d}", 0.0), ("1{:010d}00000000", 1e9)])
-def test_kitti_s_tree_with_other_names(kitti: Path, build: SimpleNamespace, name: str, first: float) -> None:
-    (kitti / "times.txt").unlink()
-    for number in (0, 1):
-        build.rename(kitti / f"image_{number}", lambda i: name.format(i) + ".png")
-    sequence = open_sequence(kitti)
-    assert seeds(sequence) == PAIRS
-    assert np.allclose(sequence.stamps, first + 0.1 * np.arange(6)) and len(sequence.ground_truth) == 6
-
-
-def test_own_images_in_a_kitti_tree(kitti: Path, raw: Path, build: SimpleNamespace) -> None:
-    """Their calibration is under one of the usual names; of a drive the images are in the cameras' folders."""
-    drive = raw.parent / "own"
-    for number in (0, 1):
-        (raw / f"image_{number:02d}" / "data").rename(drive.parent / f"{number}")
-        drive.mkdir(exist_ok=True)
-        (drive.parent / f"{number}").rename(drive / f"image_{number + 2:02d}")
-    (kitti / "calib.txt").unlink()
-    (raw.parent / "calib_cam_to_cam.txt").unlink()
-    for folder in (kitti, drive):
-        (folder / "calibration.yaml").write_text(build.FIVE)
-        sequence = open_sequence(folder)
-        assert seeds(sequence) == PAIRS and sequence.rig.baseline == pytest.approx(0.2)
-    (kitti / "calibration.yaml").rename(kitti / "my-camchain.yaml")
-    with pytest.raises(CalibrationError, match=r"is it my-camchain\.yaml\?"):
-        open_sequence(kitti)
 
 
 def write_oxts(drive: Path, records: list[str]) -> None:

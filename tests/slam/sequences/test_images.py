@@ -16,7 +16,7 @@ import pytest
 from slam.errors import SequenceError
 from slam.sequences import open_sequence
 from slam.sequences.images import MOST_PIXELS, decode_image, read_image
-from tests.fuzz.files import png
+from tests.fuzz.mutations import png
 
 SCENE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (90, 120)).astype(np.uint8), (0, 0), 1.5)
 
@@ -68,20 +68,6 @@ def test_a_jpeg_with_a_preview_or_a_turned_flag(tmp_path: Path) -> None:
             read_image(path)
 
 
-def test_what_is_no_image_at_all(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_text("hello")
-    (tmp_path / "c.png").mkdir()
-    cv2.imwrite(str(tmp_path / "d.tiff"), SCENE.astype(np.float32))
-    for name, words in (
-        ("a.png", "not a readable image"),
-        ("b.png", "there is no such file"),
-        ("c.png", ""),
-        ("d.tiff", "pixels are float32, not 8 or 16 bit"),
-    ):
-        with pytest.raises(SequenceError, match=rf"{name}: {words}"):
-            read_image(tmp_path / name)
-
-
 @pytest.mark.parametrize("size", [(8_000, 9_000), (30_000, 30_000), (2**31 - 1, 2**31 - 1), (0, 5)])
 def test_a_huge_image_is_refused_by_its_header(tmp_path, size):
     (tmp_path / "a.png").write_bytes(png(size, b""))
@@ -89,9 +75,7 @@ def test_a_huge_image_is_refused_by_its_header(tmp_path, size):
         read_image(tmp_path / "a.png")
 
 
-@pytest.mark.parametrize(
-    ("form", "channels"), [(".png", 1), (".png", 3), (".png", 4), (".tiff", 3), (".pgm", 1), (".ppm", 3)]
-)
+@pytest.mark.parametrize(("form", "channels"), [(".png", 1), (".png", 3), (".pgm", 1)])
 def test_sixteen_bits_stay_sixteen_bits(form, channels):
     pixels = np.full((6, 5, channels), 40_000, np.uint16)
     found = decode_image(cv2.imencode(form, pixels)[1].tobytes(), "x")
