@@ -103,7 +103,8 @@ def finish(summary: dict[str, Any], written: Sequence[Output], picture: bool, qu
         print(f"slam: {summary['tracking']}{no_picture}", file=sys.stderr)
     if doubt := summary.get("doubt"):
         if not summary["tracking"]:
-            print(f"slam: do not trust this path: {doubt}", file=sys.stderr)
+            red = ("\x1b[31m", "\x1b[0m") if sys.stderr.isatty() else ("", "")
+            print(f"{red[0]}slam: do not trust this path: {doubt}{red[1]}", file=sys.stderr)
         raise typer.Exit(1)
     if summary["frames"] > 1 and not summary["status"].get("tracked"):
         raise typer.Exit(1)

@@ -10,7 +10,7 @@ from slam.compare import trial
 from slam.compare.plan import Trial
 from slam.compare.sweep import RUNS, is_done, read_run
 from slam.compare.trial import COMPLETED, keep_result
-from slam.data import Estimate, FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
+from slam.data import CommonError, Estimate, FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
 from slam.errors import SlamError
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import exp
@@ -100,3 +100,13 @@ def test_a_figure_that_is_no_number_is_none_of_the_run(tmp_path):
     trial = Trial("synthetic:desk?frames=5", "ekf")
     keep_result(trial, tmp_path / RUNS / trial.folder, COMPLETED, {"segment_percent": np.nan, "ate_online_m": 0.1})
     assert read_run(trial, tmp_path).metrics == {"completed": 1.0, "ate_online_m": 0.1}
+
+
+def test_a_path_that_lacks_frames_is_said(caplog):
+    """Of a back end of one's own; the frames were left out of the final error without a word."""
+    path, covariances = estimated()
+    record = RunRecord(stamps=path.stamps.tolist(), poses=list(path.poses), covariances=list(covariances))
+    record.measured, record.common = [True] * N, [CommonError()] * N
+    record.milliseconds, record.times = [{}] * N, path.stamps.tolist()
+    results_of(SEQUENCE, SimpleNamespace(), record, path.select(np.arange(N - 3)), None)
+    assert "trajectory() lacks 3 of 120 frames" in caplog.text

@@ -82,6 +82,7 @@ def test_a_guess_is_said_with_what_was_guessed(two_folders: Path) -> None:
         ("timestamp\n", "{s:.6f}", 1.7e9, 0.1),
         ("t [s];file\n", "{s:.6f};{i:06d}.png", 1.7e9, 0.1),
         ("", "{ns}", 1.7e9, 0.1),
+        ("", "{ns0}", 0.0, 0.1),
         ("", "{i} {ns}", 1.7e9, 0.1),
         ("frame;t\n", "{n};{s:.6f}", 1.7e9, 0.1),
         ("", "2023-11-14 22:13:2{i}.500000", 1.7e9 + 0.5, 1.0),
@@ -90,7 +91,8 @@ def test_a_guess_is_said_with_what_was_guessed(two_folders: Path) -> None:
 )
 def test_times_as_other_programs_write_them(two_folders: Path, heading, row, first, step) -> None:
     """A heading is no row, which would shift all times by one; nanoseconds are no seconds."""
-    rows = [row.format(i=i, n=i + 100, s=1.7e9 + 0.1 * i, ns=17 * 10**17 + i * 10**8) + "\n" for i in range(6)]
+    ns = [{"ns0": i * 10**8, "ns": 17 * 10**17 + i * 10**8} for i in range(6)]
+    rows = [row.format(i=i, n=i + 100, s=1.7e9 + 0.1 * i, **ns[i]) + "\n" for i in range(6)]
     (two_folders / "times.txt").write_text(heading + "".join(rows))
     sequence = open_sequence(two_folders)
     assert np.allclose(sequence.stamps, first + step * np.arange(6), rtol=0, atol=1e-5) and len(sequence) == 6

@@ -169,7 +169,7 @@ def test_lists_that_are_none_are_named_with_the_row(euroc, kitti, raw, two_folde
         (kitti / "times.txt", "6\n5\n4\n3\n2\n1\n", "of 6 images 0 have no time and 5 one that does not increase"),
         (times, "half past one\n" * 6, r"timestamps\.txt, row 1: 'half past one' is not a date and time"),
         (times, "\n\n", r"timestamps\.txt: the file has no rows"),
-        (two_folders / "times.txt", "".join(f"{5e12 + k * 1e8:.0f}\n" for k in range(6)), "no possible time"),
+        (two_folders / "times.txt", "".join(f"{5e22 + k * 1e18:.0f}\n" for k in range(6)), "no possible time"),
     ):  # fmt: skip
         path.write_text(text)
         folder = next(f for f in (euroc, kitti, raw, two_folders) if f in path.parents)
