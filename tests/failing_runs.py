@@ -17,8 +17,7 @@ from slam.data import StereoFeatures, StereoFrame
 from slam.geometry.trajectory import Trajectory
 from slam.run.outputs import FRAME_COLUMNS
 from slam.run.recording import load_recording
-from tests.fuzz.harness import Broken
-from tests.fuzz.settings import scene
+from tests.fuzz.harness import Broken, scene
 
 FRAMES = 5
 

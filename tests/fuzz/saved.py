@@ -22,9 +22,8 @@ from slam.run.recording import load_recording, record, save_recording
 from slam.run.run_data import RunData
 from slam.run.runner import run_recording
 from slam.system import StereoSlam
-from tests.fuzz.harness import Broken, Subject
+from tests.fuzz.harness import Broken, Subject, scene
 from tests.fuzz.mutations import changed, choose
-from tests.fuzz.settings import scene
 
 _MAP = b"surf-stereo-slam map 7\n"
 

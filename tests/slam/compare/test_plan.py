@@ -8,7 +8,6 @@ import pytest
 from slam.commands import compare as command
 from slam.commands.compare import compare
 from slam.compare.plan import CLOSED_LOOP, Plan
-from slam.compare.sweep import check
 from slam.compare.tables import caution
 from slam.errors import ConfigurationError
 
@@ -47,12 +46,6 @@ def test_bad_plans(arguments, word):
 def test_back_ends_without_commas_are_told_how_they_are_given(tmp_path):
     with pytest.raises(ConfigurationError, match="joined by commas: --backends ekf,smoother"):
         compare(Plan(("synthetic:desk", "smoother"), ("ekf",)), tmp_path / "out")
-
-
-def test_a_recording_that_is_not_rectified_can_be_compared(tmp_path):
-    """Back ends were tried on the rig itself, which they refuse."""
-    sequence = "synthetic:desk?rig=toedin&frames=3"
-    assert check(Plan((sequence,), ("ekf", "smoother")), tmp_path / "out") == {sequence: 3}
 
 
 def test_the_time_of_a_comparison_is_told_by_its_first_frames(monkeypatch):

@@ -183,11 +183,3 @@ def test_a_path_that_cannot_be_trusted_does_not_look_like_one_that_can(doubt, st
         code = end.exit_code
     assert code == status
     assert capsys.readouterr().err == (f"slam: do not trust this path: {doubt}\n" if doubt else "")
-
-
-def test_a_baseline_that_no_hand_carries_is_the_cause_unless_it_is_a_vehicle_s():
-    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 7.5, 320, 240)
-    run = replace(record(0), depths=[110.0] * 11)
-    words = "likely cause: by the calibration the cameras are 7.5 m apart and what they see is 110 m away"
-    assert words in outcome(run, rig)
-    assert "no hand" not in outcome(run, rig, driving=True)

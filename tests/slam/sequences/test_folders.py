@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 
 import slam
-from slam.errors import CalibrationError, ConfigurationError, SequenceError
+from slam.errors import CalibrationError, SequenceError
 from slam.input.features import outside_masks
 from slam.sequences import open_sequence, with_mask
-from slam.sequences.base import said_before
 from tests import recordings
 from tests.recordings import FIVE, rename, seeds
 
@@ -157,20 +156,6 @@ def test_times_and_rate_can_be_told(two_folders: Path) -> None:
     assert np.allclose(open_sequence(two_folders).stamps, 7 + 0.3 * np.arange(1, 6))
 
 
-def test_what_is_assumed_is_said_once_and_not_above_an_error(
-    two_folders: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    said = open_sequence(two_folders).warnings
-    assert [record.getMessage() for record in caplog.records] == said
-    with said_before():
-        assert open_sequence(two_folders).warnings == said
-    assert len(caplog.records) == 1
-    next(two_folders.glob("*.y*ml")).write_text("")
-    with pytest.raises(CalibrationError):
-        open_sequence(two_folders)
-    assert len(caplog.records) == 1
-
-
 # ------------------------------------------------------------------------------------------------ layouts
 
 
@@ -186,16 +171,6 @@ def test_folders_by_other_usual_names(two_folders: Path, names: tuple[str, str])
         (two_folders / usual).rename(two_folders / name)
     assert seeds(open_sequence(two_folders)) == PAIRS
     assert seeds(open_sequence(f"{two_folders}?swap=yes")) == [(b, a) for a, b in PAIRS]
-
-
-@pytest.mark.parametrize("missing", ["left", "right"])
-def test_exchanged_images_without_a_partner_are_left_out_and_said(two_folders: Path, missing: str) -> None:
-    sorted((two_folders / missing).iterdir())[3].unlink()
-    sequence = open_sequence(f"{two_folders}?swap=yes&fps=10")
-    assert len(sequence) == 5 and seeds(sequence) == [(b, a) for a, b in PAIRS if a != 3]
-    assert np.allclose(sequence.stamps, [0.0, 0.1, 0.2, 0.4, 0.5])
-    (line,) = [line for line in sequence.warnings if "without a partner" in line]
-    assert line.endswith("left out")
 
 
 def test_one_folder_with_both_cameras_in_it_and_patterns(two_folders: Path) -> None:
@@ -343,20 +318,3 @@ def test_a_video_that_ends_too_early(videos: Path, build: SimpleNamespace) -> No
     run = subprocess.run([sys.executable, "-c", code, str(videos)], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == str(len(frames))
     assert run.stderr.count("\n") == 1  # our line alone (logging's last resort), none of the decoder's
-
-
-def test_faulty_videos(videos: Path, build: SimpleNamespace) -> None:
-    def refused(words: str, query: str = "", error: type[Exception] = SequenceError) -> None:
-        with pytest.raises(error, match=words):
-            open_sequence(f"{videos}{query}")
-
-    write_video(videos / "right.avi", grey(100, size=(32, 48)))
-    refused(r"differ in size: .*left\.avi is 64x48, .*right\.avi is 32x48")
-    (videos / "right.avi").write_bytes(b"hello" * 100)
-    refused(r"right\.avi: not a readable video")
-    (videos / "right.avi").unlink()
-    refused("two cameras are needed, but there is no right one")
-    build.write_image(videos / "right" / "0.png", 0)
-    refused("one is a video and the other is not")
-    write_video(videos / "other.avi", grey(1))
-    refused("option 'times' does nothing here", "?right=other.avi&times=t.txt", ConfigurationError)

@@ -40,39 +40,6 @@ def test_whoever_is_too_slow_gets_the_newest_and_what_is_left_out_is_counted():
     assert live.dropped == 100 - len(indices)
 
 
-def test_a_frame_is_the_newest_when_it_is_taken():
-    taken, all_given, looked = threading.Event(), threading.Event(), threading.Event()
-
-    def camera():
-        first, *others = frames(5)
-        yield first
-        taken.wait(10)
-        yield from others
-        all_given.set()
-        looked.wait(10)
-
-    live = LiveFrames(camera(), paced=False)
-    taking = iter(live)
-    assert next(taking).index == 0
-    taken.set()
-    assert all_given.wait(10)
-    assert next(taking).index == 4
-    assert live.dropped == 3
-    looked.set()
-    assert list(taking) == []
-
-
-def test_a_clock_waits_for_slow_reading():
-    def slow():
-        for frame in frames(5, 0.001):
-            time.sleep(0.03)
-            yield frame
-
-    live = LiveFrames(slow())
-    assert [frame.index for frame in live] == list(range(5))
-    assert live.clock_waited > 0.1 and live.dropped == 0
-
-
 def test_it_ends_while_no_frame_comes_although_the_driver_is_stuck(monkeypatch):
     monkeypatch.setattr("slam.sequences.live._PARTING", 0.05)
     stuck, until = threading.Event(), threading.Event()

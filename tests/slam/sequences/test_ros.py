@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import slam
-from slam.errors import CalibrationError, ConfigurationError, SequenceError, SlamError
+from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.sequences.ros_bag import COMPRESSED, INFO, RAW, grey_image
 from tests.bags import (
     LEFT,
@@ -163,26 +163,6 @@ def test_compressed_images(tmp_path: Path) -> None:
     assert seeds(sequence) == [(k, k + 10) for k in range(6)]
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"encoding": "jpg9"}, "encoding 'jpg9' is not supported"),
-        ({"height": 400}, "image is 6x400, not 6x4"),
-        ({"step": 2}, "bytes are too few"),
-        ({"data": np.zeros(5, np.uint8)}, "5 bytes are too few"),
-    ],
-)
-def test_messages_that_do_not_agree_with_themselves(change: dict, words: str) -> None:
-    message = image(STORES[2], T0, np.zeros((4, 6), np.uint8))
-    for name, value in change.items():
-        object.__setattr__(message, name, value)
-    with pytest.raises(SequenceError, match=words):
-        grey_image(message, RAW, "/x", (6, 4))
-    object.__setattr__(message, "width", 2**31)
-    with pytest.raises(SequenceError, match="at most 67108864 pixels"):
-        grey_image(message, RAW, "/x")
-
-
 def test_a_damaged_image_costs_its_frame_alone(tmp_path: Path) -> None:
     store, rows = STORES[1], stereo(STORES[1])
     for k, (topic, kind, time, message) in enumerate(rows):
@@ -263,30 +243,6 @@ def test_without_camera_messages_a_calibration_file_and_names_decide(tmp_path: P
     sequence = slam.open_sequence(f"{path}?calibration=five.yaml")
     assert sequence.rig.baseline == pytest.approx(0.2)
     assert seeds(sequence) == [(k, k + 10) for k in range(6)]
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"K": np.zeros(9)}, "left camera is not calibrated"),
-        ({"distortion_model": "kannala"}, "distortion model 'kannala' is not supported"),
-        ({"binning_x": 2}, "binning"),
-        ({"width": 32}, "images are 64x48, but .* is for 32x48"),
-        ({"K": np.full(9, np.nan)}, "K is not finite"),
-    ],
-)
-def test_cameras_that_are_not_calibrated(change: dict, words: str, tmp_path: Path) -> None:
-    store, rows = STORES[1], stereo(STORES[1])
-    rows[0] = (*rows[0][:3], info(store, 0.0, **change))
-    rows[1] = (*rows[1][:3], info(store, 0.2, R_RIGHT, **({"width": 32} if "width" in change else {})))
-    with pytest.raises(SlamError, match=words):
-        slam.open_sequence(write(tmp_path / "wrong.bag", rows))
-
-
-def test_without_the_package_the_line_says_how_to_install_it(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("slam.sequences.ros_bag.find_spec", lambda name: None)
-    with pytest.raises(SequenceError, match=r"rosbags, which is not installed: pip install rosbags$"):
-        slam.open_sequence(bag)
 
 
 def test_what_is_no_recording_is_one_line(tmp_path: Path) -> None:
