@@ -93,7 +93,6 @@ METRICS = (
            "lower"),
     Metric("segment_percent", "drift by distance (RPE)", "%", "accuracy/online/segment error [%]", "lower",
            "compared run"),
-    Metric("scale_error_percent", "scale error", "%", "consistency/scale error [%]", "lower"),
     Metric("sigma_m", "claimed σ of the last position", "mm", "final_sigma_m", shown="run picture"),
     Metric("ratio", "errors over claimed σ (1 is right)", shown="run"),
     Metric("nees_10m_per_dof", "NEES / 6 over 10 m (1 is right)", "", "consistency/NEES over 10 m", "one",
@@ -141,8 +140,6 @@ def figures(summary: Mapping[str, Any]) -> dict[str, float]:
         few = (honest.get(f"no covariance {_NEES.get(m.key)}") or 0.0) > _FEW
         if known and not few and (bodies or "moving" not in m.key):  # what is found of nothing is no figure
             found[m.key] = float(np.mean(known)) / (6 if "nees" in m.key else 1)
-    if "scale_error_percent" in found:
-        found["scale_error_percent"] = abs(found["scale_error_percent"])
     if frames := summary.get("frames", 0):
         found["tracked"] = _measured(summary) / frames
     found[DOUBTED] = float(bool(summary.get("doubt")))

@@ -134,7 +134,6 @@ def test_what_is_asked_for_wrongly_is_one_line(rig_here, played, tmp_path):
     played({"0": [grey(0, 64)], "1": [grey(0)], "2": [grey(0, 161)], "3": []})
     wrong = {
         "camera:": "name one device",
-        "camera:?left=0": "both left",
         "camera:0?colour=yes": "unknown option 'colour' of format camera",
         "camera:0?wait=long": "wait must be a number",
     }

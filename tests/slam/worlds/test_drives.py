@@ -33,7 +33,6 @@ def test_paths_are_read_in_the_forms_of_kitti_and_tum(tmp_path):
         ("", "has 8 columns, found"),
         ("hello\n", "cannot be read as a trajectory"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n", r"a path of 0\.0 m in 1 poses; a drive needs 10 m to 100 km"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 1 99\n", "row 1 is 99 m from the one before"),
         ("1 0 0 0 0 0 0 0 0 0 1 0\n", "the pose of row 0 has no rotation"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n-1 0 0 0 0 -1 0 0 0 0 1 20\n", "y axis must point downwards"),
     ],
