@@ -15,7 +15,7 @@ from typing import Annotated, Any, TypeAlias
 
 import typer
 
-from slam.commands.ending import catch_signals, leaving, one_line_errors, whole_frames
+from slam.commands.ending import catch_signals, one_line_errors, whole_frames
 from slam.registry import ONLINE
 from slam.runtime.memory import require_address_space
 
@@ -269,8 +269,7 @@ def compare_command(
     masked, names = (with_mask(text, mask) for text in sequences), filter(None, backends.split(","))
     start, stop = parse_frames(frames)
     plan = Plan(tuple(masked), tuple(names), frontend, tuple(settings or ()), trials, start, stop, replay)
-    with leaving("trials done so far are kept: the same command continues"):
-        command.compare(plan, out, workers, quiet, overwrite, command_line())
+    command.compare(plan, out, workers, quiet, overwrite, command_line())
 
 
 @app.command("calibrate", short_help="Find a stereo rig's error from its recordings.")
@@ -291,8 +290,7 @@ def calibrate_command(
     from slam.sequences import with_mask
 
     texts = [with_mask(text, mask) for text in sequences]
-    with leaving("nothing is written"):
-        calibrate(texts, out, settings or [], parse_frames(frames), format, quiet, opencv, overwrite)
+    calibrate(texts, out, settings or [], parse_frames(frames), format, quiet, opencv, overwrite)
 
 
 @app.command("render", short_help="Write a built-in sequence as a folder.")

@@ -18,7 +18,7 @@ from slam.errors import ConfigurationError, SequenceError, UnknownNameError
 from slam.files import expanded, note_input, reason
 from slam.naming import nearest, unknown
 from slam.sequences import euroc, folders, kitti, ros
-from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, read_masks, say, turned
+from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, logger, read_masks, turned
 from slam.sequences.folders import VIDEO_SUFFIXES
 from slam.sequences.images import IMAGE_SUFFIXES
 from slam.sequences.options import RECORDED, Options, read_options
@@ -121,7 +121,7 @@ def _open_folder(text: str, format: str | None) -> RecordedSequence:
         swap = options.get("swap", False)
         options.require_read(f"{folder} is read as {name}")
     for line in lines:
-        say(line)
+        logger.warning("%s", line)
     truth = turned(found.ground_truth, found.rig)
     return replace(found, ground_truth=truth, masks=masks, swap=swap, warnings=lines)
 
