@@ -112,15 +112,8 @@ def demo_command(
 
 @app.command("run", short_help="Run one sequence through one back end.")
 def run_command(
-    sequence: Annotated[
-        _Text,
-        argument(
-            "A folder, a ROS recording, camera:0, or synthetic:NAME?key=value; with --config the earlier one.",
-            "SEQUENCE",
-        ),
-    ] = None,
+    sequence: Annotated[str, argument("A folder, a ROS recording, camera:0, or synthetic:NAME?key=value.", "SEQUENCE")],
     out: _RunOut = None,
-    config: Annotated[_File, option("config.json of an earlier run; other options change it.", "FILE")] = None,
     backend: _Backend = None,
     frontend: Annotated[_Text, option("Front end, see `slam list`; default: surf.", "NAME")] = None,
     settings: _Set = None,
@@ -154,15 +147,12 @@ def run_command(
     from slam.run.warm_up import compile_kernels
     from slam.sequences import is_live, with_mask
 
-    sequence = None if sequence is None else with_mask(sequence, mask)
-    if sequence is None and mask is not None:
-        raise ConfigurationError("--mask goes with a SEQUENCE; --config repeats a run with its own")
     if draw_map and draw is None:
         raise ConfigurationError("--draw-map draws beside the frames: give --draw FILE.mp4, or a folder, too")
     with noting_inputs() as inputs:
         opened, options = prepare(
-            sequence, config, settings or (), frames, backend=backend, frontend=frontend, kind=kind, format=format,
-            prior_map=prior_map, mono=mono, calibration=calibration, record=record, save_map=save_map, live=live,
+            with_mask(sequence, mask), settings or (), frames, backend=backend, frontend=frontend, kind=kind,
+            format=format, prior_map=prior_map, mono=mono, calibration=calibration, record=record, save_map=save_map, live=live,
         )  # fmt: skip
     shown_as = frame_count(opened, options.start, options.stop), title(opened, options.backend), quiet
     with ExitStack() as stack:
