@@ -152,7 +152,8 @@ def run_command(
     with noting_inputs() as inputs:
         opened, options = prepare(
             with_mask(sequence, mask), settings or (), frames, backend=backend, frontend=frontend, kind=kind,
-            format=format, prior_map=prior_map, mono=mono, calibration=calibration, record=record, save_map=save_map, live=live,
+            format=format, prior_map=prior_map, mono=mono, calibration=calibration, record=record, save_map=save_map,
+            live=live,
         )  # fmt: skip
     shown_as = frame_count(opened, options.start, options.stop), title(opened, options.backend), quiet
     with ExitStack() as stack:
