@@ -134,7 +134,6 @@ EXPERIMENTS = (
         "descriptors", "papers", "16 and 64 dimensions, known points (A, III.B, first experiment)",
         "16-D takes 45 % less time for 100 to 800 features, and is best in the estimation of known points; no figures "
         "of the latter are printed.",
-        {"descriptors": "Left: time of description. Right: error of the map's points, a line for each seed."},
     ),
     Experiment(
         "aisle", "papers", "The bookshelf aisle (A, V, Figs. 5 and 6)",

@@ -25,12 +25,6 @@ from slam.sequences.options import RECORDED, Options, read_options
 
 __all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
 
-#: What to do with files that are no sequence, by their endings.
-_HINTS = {
-    **dict.fromkeys((".zip", ".7z", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".lz4"), "unpack it first"),
-    **dict.fromkeys((".svo", ".svo2"), "export it as a video of both images side by side"),
-    **dict.fromkeys(IMAGE_SUFFIXES, "give the folder that holds both cameras' images"),
-}
 _LOOKED_AT = 500  # entries below a folder that is no sequence, at each of so many levels
 _LEVELS = 4
 _LISTED = 6  # sequences below a folder
@@ -169,11 +163,10 @@ def _format_asked(folder: Path, query: str, text: str) -> str | None:
         return "ros"
     if not folder.exists():
         what = "file or folder" if folder.suffix else "folder"
-        raise SequenceError(f"{folder}: there is no such {what}{_hint_name(folder, text)}")
+        raise SequenceError(f"{folder}: there is no such {what}{_hint_name(text)}")
     if not folder.is_dir() and "layout" not in named:
-        ending = folder.suffix.lower()
-        hint = f"; {_HINTS[ending]}" if ending in _HINTS else ""
-        if ending in VIDEO_SUFFIXES:
+        hint = "; give the folder that holds both cameras' images, unpacked"
+        if folder.suffix.lower() in VIDEO_SUFFIXES:
             two = f"two are {folder.parent}?left=…&right=…"
             hint = f"; a video with both images side by side is {folder}?layout=sbs, {two}"
         raise SequenceError(f"{folder}: a file where the sequence's folder should be{hint}")
@@ -182,16 +175,13 @@ def _format_asked(folder: Path, query: str, text: str) -> str | None:
     return "folders" if named & {"left", "right", "layout"} else _format_of(folder)
 
 
-def _hint_name(folder: Path, text: str) -> str:
-    """A world with a similar name, or the part of the path that is missing first; `text` was asked for."""
+def _hint_name(text: str) -> str:
+    """A world with a similar name than what was asked for."""
     from slam import worlds
 
     name, mark, query = text.partition("?")
-    near = None if Path(name).name != name else nearest(name, worlds.names())
-    if near:
-        return f" (did you mean 'synthetic:{near}{mark}{query}'?)"
-    there = next((parent for parent in folder.parents if parent.is_dir()), folder.parent)
-    return "" if there == folder.parent else f": {there} has no {folder.relative_to(there).parts[0]!r}"
+    near = nearest(name, worlds.names())
+    return f" (did you mean 'synthetic:{near}{mark}{query}'?)" if near else ""
 
 
 def _hint_near(folder: Path) -> str:
