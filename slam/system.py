@@ -347,18 +347,14 @@ class StereoSlam:
     @property
     def warnings(self) -> list[str]:
         """Warnings about images, stamps, baseline or calibration, one line each (see `slam.input`)."""
-        said = self._extractor.input_warnings
-        return [*said.lines, *filter(None, [said.repeated, *self._doubts])]
+        said, doubt = self._extractor.input_warnings, self.doubt
+        lines = [*said.lines, *filter(None, [said.repeated])]
+        return lines if doubt in ("", *lines) else [*lines, doubt]
 
     @property
     def doubt(self) -> str:
-        """Why no path by these images can be trusted, one of the `warnings`; empty where none says so."""
-        return next(filter(None, [self._extractor.input_warnings.doubt, *self._doubts]), "")
-
-    @property
-    def _doubts(self) -> list[str]:
-        """What the features of the whole run contradict; empty words where nothing."""
-        return [self._moment.doubt, self.calibration.doubt]
+        """Why no path by these images can be trusted, one of the `warnings`; empty where nothing says so."""
+        return self._extractor.input_warnings.doubt or self._moment.doubt or self.calibration.doubt
 
     def __getstate__(self) -> dict[str, object]:
         """State for copying and pickling; refused while another thread is in a step."""

@@ -249,9 +249,19 @@ def _swapped(found: PairGeometry) -> str:
 
 def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
     """That rows do not agree, and the likely cause: images that were rectified twice, or never."""
+    left, right = rig.left, rig.right
+    plain = not (left.has_distortion or right.has_distortion or np.abs(rig.R - np.eye(3)).max() > 1e-9)
     if found.turned:
         cause = "the images are turned by 90°, or the cameras stand above each other: turn both, or calibrate them so"
-    elif not (rig.left.has_distortion or rig.right.has_distortion or np.abs(rig.R - np.eye(3)).max() > 1e-9):
+    elif found.shown < 1 and plain:
+        fx, fy, cy = (
+            f"{a:.1f} and {b:.1f}" for a, b in ((left.fu, right.fu), (left.fv, right.fv), (left.v0, right.v0))
+        )
+        return (
+            f"rows of left and right image show {100 * max(found.shown, 0.0):.0f} % of what rectification by focal "
+            f"lengths and principal points does to them (fx {fx}, fy {fy}, cy {cy} px): is one of them mistyped?"
+        )
+    elif plain:
         cause = (
             "were they rectified, as this calibration says (no distortion or rotation), and are they of one moment, or "
             "must numbers be shifted by one?"

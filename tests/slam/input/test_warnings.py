@@ -147,13 +147,13 @@ SAID = {
     ),
     "no texture yet": (every(4), {"features": 3}, ""),
     # a calibration's file names no size: that of the images is taken
-    "half size": (every(12), {"rig": of_size(0.5), "stereo": 3}, "calibration for images of another size"),
-    "double size": (every(12), {"rig": of_size(2.0), "stereo": 3}, "calibration for images of another size"),
+    "half size": (every(12), {"rig": of_size(0.5), "stereo": 3}, "for images of about 160x120 px, 0.5 times the size"),
+    "double size": (every(12), {"rig": of_size(2.0), "stereo": 3}, "for images of about 640x480 px, 2 times the size"),
     "same size": (every(12), {"rig": of_size(1.0)}, ""),
     "KITTI": (stamped([0.0]), {"rig": KITTI}, ""),
     "rectified twice": (every(3), {"rig": DISTORTED}, "images were rectified before, or undistorted, and are again"),
     "equal lenses": (every(3), {"rig": ALIKE}, "images were rectified before, or undistorted, and are again"),
-    "of a size a fifth larger": (every(3), {"rig": of_size(1.2)}, "middle of the images.* cropped or turned"),
+    "of a size a fifth larger": (every(3), {"rig": of_size(1.2)}, "384x288 px, 1.2 times .* or these were cropped"),
     "cx and cy exchanged": (
         every(3), {"rig": slam.StereoRig.rectified_pair(300.0, 120.0, 160.0, 0.12, 320, 240)}, "cx and cy exchanged"
     ),
@@ -162,6 +162,10 @@ SAID = {
         "300 px along rows and 350 px along columns, differ, but pixels are square",
     ),
     "mirrored": (every(1, lambda a, b: (a, b[:, ::-1].copy())), {"stereo": 40}, "one of the images looks mirrored"),
+    "fy of one camera": (
+        every(3), {"rig": slam.StereoRig(replace(RIG.left, fv=275.0), RIG.right, RIG.R, RIG.b)},
+        r"show 0 % .*fy 275\.0 and 260\.0.*mistyped",
+    ),
     "turned": (every(3, turned), {}, "the images are turned by 90°, or the cameras stand above each other"),
     "bytes exchanged": (
         every(3, lambda a, b: tuple((x.astype(np.uint16) * 16).byteswap() for x in (a, b))), {}, "two bytes of each"
