@@ -162,7 +162,8 @@ class _Matches:
         import cv2
 
         bearings = (self.z[:, :2] - [self.stereo.u0, self.stereo.v0]) / self.stereo.f
-        turns, shifts = [], []
+        turns: list[Array] = []
+        shifts: list[Array] = []
         for points, rays in zip(self.points[triples], bearings[triples]):
             _, some, there = cv2.solveP3P(points, rays, _CAMERA, None, cv2.SOLVEPNP_P3P)
             turns += [cv2.Rodrigues(turn)[0] for turn in some]
