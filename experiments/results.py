@@ -90,7 +90,7 @@ PAGES = {
     ),
     "cost": (
         "Cost",
-        "What does a frame cost, next to others, and how does that grow?",
+        "What does a frame cost, next to others?",
         "About the CPU time of SIFT for one image, or half of it, however long the run.",
     ),
 }
@@ -171,12 +171,6 @@ EXPERIMENTS = (
         "`cv2.SIFT` on one image and to ORB-SLAM3 on the same images; with overlap, times from one result to the next. "
         "CPU time adds up all threads.",
         left_out=("ATE [mm]", "frames lost", "wall / SIFT", "CPU / SIFT"),
-    ),
-    Experiment(
-        "growth", "cost", "How it grows", folder="benchmarks", pictures={"growth": "Floors are dashed."},
-        says="CPU time over the number of landmarks, features and moving cars, and of what cannot be done "
-        "without (floor, dashed): the filter's bare `dsyrk`, gtsam's own calls, SURF alone, no detector.",
-        left_out=("by",),
     ),
     Experiment(
         "command", "cost", "Whole runs", folder="benchmarks",

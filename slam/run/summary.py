@@ -49,8 +49,6 @@ class RunRecord:
     features: list[tuple[int, int]] = field(default_factory=list)  # number of them, and of those with a right pixel
     without_right: list[int] = field(default_factory=list)  # rows of frames without a right image
     depths: list[float] = field(default_factory=list)  # median of what each frame sees [m]
-    # of pairs of tracked frames, see `row_flow`: of the second one from the first, of the first one from the second
-    row_flows: list[tuple[Array, Array]] = field(default_factory=list)
     bodies: set[int] = field(default_factory=set)
     seen: Counter[int] = field(default_factory=Counter)  # number of frames in which each landmark was measured
     last_seen: dict[int, int] = field(default_factory=dict)  # number of the last of them
