@@ -55,7 +55,7 @@ class FilterState:
     def advanced(self, stamp: float, motion: Motion) -> FilterState:
         """At a later time, after a motion of the camera."""
         camera, J, noise = motion
-        covariance = self.covariance.with_pose(self.camera.by_error(), RECENT).camera_moved(J, noise)
+        covariance = self.covariance.advanced(self.camera.by_error(), RECENT, J, noise)
         dt, frame = stamp - self.stamp, self.frame + 1
         return replace(self, stamp=stamp, frame=frame, dt=dt, closed=False, camera=camera, covariance=covariance)
 
@@ -168,7 +168,7 @@ class FilterState:
         marks.seen[update.rows[found.used]] = self.frame
         J, shift = update.camera.transport(camera), self._shift(marks, camera)
         covariance = update.covariance.corrected(*found.whitened.gain_root(), J, shift)
-        if not (covariance.marks.diagonal() > 0).all():
+        if not (covariance.P.diagonal()[covariance.first :] > 0).all():
             raise UnsolvableError("a landmark's variance would not stay positive")
         return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()
 

@@ -219,10 +219,9 @@ def test_a_point_predicted_behind_the_camera_does_no_harm(drive):
 def test_a_broken_covariance_is_a_status_with_a_reason(drive, entry, where):
     backend, seen = predicted(drive, 5)
     P = backend.state.covariance
-    head, marks = P.head.copy(), P.marks.copy()
-    row = 1 if where == "pose" else 3 * int(backend.state.landmarks.rows_of(seen.ids[3:4])[0])
-    (head if where == "pose" else marks)[row, row] = entry
-    backend.state = replace(backend.state, covariance=replace(P, head=head, marks=marks))
+    broken, row = P.P.copy(), 1 if where == "pose" else P.numbers(backend.state.landmarks.rows_of(seen.ids[3:4]))[0, 0]
+    broken[row, row] = entry
+    backend.state = replace(backend.state, covariance=replace(P, P=broken))
     before = backend.state
     report = backend.update(seen)
     assert report.status is UpdateStatus.FAILED and "ekf" in report.reason
