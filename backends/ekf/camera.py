@@ -60,7 +60,7 @@ class Camera(Protocol):
         """
 
     def advanced(self, dt: float) -> tuple[Self, Array, Array]:
-        """After `dt` [s] of constant velocity; its error (12,) is A (12, 12) times what it was, plus W (12, 6) impulses."""
+        """After `dt` [s] of constant velocity: its error is A (12, 12) times what it was and W (12, 6) impulses."""
 
     def stopped(self) -> Self:
         """With the same pose, and no velocity."""

@@ -105,9 +105,9 @@ class Covariance:
     # --- the camera moves ---
 
     def advanced(self, by_error: Array, most: int, J: Array, noise: Array) -> Covariance:
-        """After a motion of the camera; its pose before it, `by_error` (6, 6) times [r, φ], is the first of the last ones.
+        """After a motion of the camera, see `camera_moved`.
 
-        At most so many are kept. For J and the noise see `camera_moved`.
+        Its pose before, `by_error` (6, 6) times [r, φ], is the first of the last ones; at most so many are kept.
         """
         kept = min(self.poses, most - 1)
         n, end = np.arange(len(self.P)), CAMERA + POSE * kept
@@ -184,8 +184,8 @@ class Covariance:
         P[CAMERA:b, b:] -= V[CAMERA:b] @ V[b:].T
         by_rig[:CAMERA], by_rig[b:] = by_rig[:CAMERA] - V[:CAMERA] @ lost_by_rig, by_rig[b:] - V[b:] @ lost_by_rig
         P[:CAMERA], by_rig[:CAMERA] = J @ P[:CAMERA], J @ by_rig[:CAMERA]
-        own = P[:CAMERA, :CAMERA] @ J.T
-        own = positive(0.5 * (own + own.T), self.camera.diagonal(), V.shape[1])
+        moved = P[:CAMERA, :CAMERA] @ J.T
+        own = positive(0.5 * (moved + moved.T), self.camera.diagonal(), V.shape[1])
         gone, across = V[b:] @ V[b:].T, (P[:POSE, b:].T + 0.5 * shift @ own[:POSE, :POSE]) @ shift.T
         gone -= across
         gone -= across.T

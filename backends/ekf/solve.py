@@ -144,11 +144,11 @@ def _iterate(innovation: Innovation, used: BoolArray) -> Posterior:
     Where the first is not linear, the guess is the next place. One iteration is taken as it is: the papers' filter.
     What comes to lie behind the camera counts no more.
     """
-    update = innovation.at.update
+    update, posterior = innovation.at.update, None
     for iteration in range(update.iterations):
         if iteration == 1 and update.guess is not None:
             innovation = update.at(update.camera.at(update.guess)).innovation()
-        elif iteration:
+        elif posterior is not None:
             innovation = update.at(posterior.camera, posterior.change[CAMERA:]).innovation()
         used = used & innovation.seen.any(axis=1)
         whitened = innovation.whitened(used)
@@ -158,6 +158,7 @@ def _iterate(innovation: Innovation, used: BoolArray) -> Posterior:
         posterior = Posterior(whitened, change)
         if update.iterations == 1 or _linear(posterior):
             break
+    assert posterior is not None  # there is one iteration at least
     return posterior
 
 
