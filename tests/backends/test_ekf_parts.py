@@ -70,19 +70,6 @@ def test_a_new_angles_world_is_the_same_state(phi):
     np.testing.assert_allclose(J, jacobian(moved, np.zeros(12)), atol=1e-7)
 
 
-@pytest.mark.parametrize("turn", [(0, 0, 1.5), (0, 0, 3.14), (1.5, 0, 0), (0, 2.0, 0), (1.0, 1.2, 1.5), (0, 0, 0)])
-def test_a_way_that_leads_to_the_singularity_gets_another_angles_world(turn):
-    """In which neither end of it is near; the state is the same."""
-    camera, _ = EulerCamera.first(MODELS, True)
-    camera = replace(camera, x=camera.x + np.linspace(0.01, 0.1, 12))
-    T = camera.pose @ se3.exp(np.array([*turn, 0, 0, 0]))
-    new, _ = camera.facing(T)
-    assert (new is camera) == (abs(np.sin(camera.at(T).x[4])) <= np.sqrt(0.5))
-    world, _ = camera.reanchored(T)
-    np.testing.assert_allclose(world.pose, camera.pose, atol=1e-12)
-    assert abs(world.x[4]) < 1e-9 and abs(np.sin(world.at(T).x[4])) < 0.11
-
-
 def test_a_step_in_pieces_has_the_noise_of_a_whole_one():
     """A fast turn runs through the singularity; its position had less noise than a slow one's."""
     first, _ = EulerCamera.first(MODELS, True)
@@ -200,15 +187,6 @@ def test_the_last_poses_are_kept():
     found = np.delete(back.P[12:24], np.s_[12 : 24 + 6], axis=1)
     assert_equal_to_rounding(found, np.concatenate([poses[2], poses[1]]) @ P[:6, g])
     assert_equal_to_rounding(back.joint_poses(np.eye(6), 3)[-6:, -6:], P[:6, :6])
-
-
-def test_the_camera_moves():
-    covariance, P = grown(np.random.default_rng(8))
-    J, noise = np.eye(len(P)), positive(CAMERA, np.random.default_rng(7))
-    J[:CAMERA, :CAMERA] = np.random.default_rng(9).standard_normal((CAMERA, CAMERA))
-    P = J @ P @ J.T
-    P[:CAMERA, :CAMERA] += noise
-    assert_equal_to_rounding(whole(covariance.camera_moved(J[:CAMERA, :CAMERA], noise)), P)
 
 
 def test_a_correction_and_its_transport():
@@ -422,23 +400,6 @@ def test_a_prior_that_cannot_be_tried_does_not_end_the_others(monkeypatch):
 
     monkeypatch.setattr("backends.ekf.recovery.gate", failing)
     assert agreement(replace(update, guess=np.eye(4)), lambda: None).used.sum() >= 5
-
-
-def test_a_displaced_landmark_keeps_what_nothing_measures():
-    """Its error by a displacement of the world is that where it is now; so it is for one that had left the state."""
-    s, _, rng = state_of(8, InverseDepth())
-    s = replace(s, camera=replace(s.camera, transports=True))
-    points = s.landmarks.points + 0.3 * rng.standard_normal((8, 3))
-    P, W, change = dense(s.covariance), s.camera.world(), s.displaced(InverseDepth(), np.arange(8), points)
-    T = np.eye(36)
-    T[12:, :6] = (change.landmarks.gauge - s.landmarks.gauge).reshape(-1, 6) @ W
-    assert_equal_to_rounding(dense(change.covariance), T @ P @ T.T)
-    np.testing.assert_allclose(change.landmarks.points, points, atol=1e-9)
-    some = s._rearranged(np.array([2, 5]), np.array([0, 1, 3, 4, 6, 7]), np.arange(0))
-    other = some.displaced(InverseDepth(), np.arange(8), points)
-    rows = other.landmarks.rows_of(np.arange(8))
-    g = np.concatenate([np.arange(12), (12 + 3 * rows[:, None] + np.arange(3)).reshape(-1)])
-    assert_equal_to_rounding(dense(other.covariance)[np.ix_(g, g)], T @ P @ T.T)
 
 
 def test_what_is_taken_out_was_never_there():
