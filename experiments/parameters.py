@@ -3,7 +3,7 @@
     python experiments/parameters.py [--page docs/parameters.md] [--sensitivity FILE]
 
 Writes the page from the constants' own comments and from what `experiments/sensitivity.py` measured, where its table is
-given. A constant's comment says what it is, its unit in brackets, and where it comes from.
+given; what that has of constants that are gone is taken out of it. A constant's comment says what it is, its unit in brackets, and where it comes from.
 """
 
 from __future__ import annotations
@@ -178,7 +178,12 @@ def main() -> int:
     parser.add_argument("--sensitivity", type=Path, default=ROOT / "docs" / "sensitivity.json")
     arguments = parser.parse_args()
     table = json.loads(arguments.sensitivity.read_text()) if arguments.sensitivity.exists() else {}
-    arguments.page.write_text(page(find(), table), encoding="utf-8")
+    parameters = find()
+    if table:
+        present = {f"{p.module}:{p.name}" for p in parameters}
+        table["ratios"] = {name: each for name, each in table["ratios"].items() if name in present}
+        arguments.sensitivity.write_text(json.dumps(table, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    arguments.page.write_text(page(parameters, table), encoding="utf-8")
     return 0
 
 
