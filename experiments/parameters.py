@@ -3,7 +3,8 @@
     python experiments/parameters.py [--page docs/parameters.md] [--sensitivity FILE]
 
 Writes the page from the constants' own comments and from what `experiments/sensitivity.py` measured, where its table is
-given; what that has of constants that are gone is taken out of it. A constant's comment says what it is, its unit in brackets, and where it comes from.
+given; constants that are gone are taken out of that table. A constant's comment says what it is, its unit in brackets,
+and where it comes from.
 """
 
 from __future__ import annotations
