@@ -45,10 +45,10 @@ KINDS = {
 }
 
 SENSITIVITY = """\
-The columns ½ and 2 are for half and twice the number: the error of the camera's position and of the bodies' motion, over
-that with the default; the worse of two back ends, geometric mean over short runs of {cases} (`python
-experiments/sensitivity.py`). A number changes a result if one of these is beyond the scatter under small perturbations of
-the pixels, factors of {camera:.2f} and {bodies:.2f}, or if a run fails.
+The columns ½ and 2 are for half and twice the number: the error of the camera's position and of the bodies' motion,
+over that with the default; the worse of two back ends, geometric mean over short runs of {cases} (`python
+experiments/sensitivity.py`). A number changes a result if one of these is beyond the scatter under small perturbations
+of the pixels, factors of {camera:.2f} and {bodies:.2f}, or if a run fails.
 """
 
 #: What a number does at half or twice its value, by column of the summary.

@@ -110,8 +110,8 @@ EXPERIMENTS = (
     ),
     Experiment(
         "ablation", "recordings", "What each part is worth", left_out=("larger in", "NEES"),
-        says="Ratios to a run of `ekf` with everything on: medians over the trials, means over the sequences; the sequence "
-        "with the largest.",
+        says="Ratios to a run of `ekf` with everything on: medians over the trials, means over the sequences; the "
+        "sequence with the largest.",
     ),
     Experiment(
         "knee", "recordings", "How many features and landmarks",
