@@ -115,7 +115,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "knee", "recordings", "How many features and landmarks",
-        left_out=("±", "ekf", "window", "CPU extract", "NEES", "measured"),
+        left_out=("±", "ekf", "window", "CPU extract", "CPU window", "NEES", "bodies", "measured"),
         says="Ratios to 800 features, and to 150 (handheld 80) landmarks in view.",
     ),
     Experiment(
