@@ -52,7 +52,6 @@ class Body:
     certain: int = 0  # what frames so far count for the proof that it moves, see `slam.bodies.proof`
     agreeing: int = 0  # number of members, added over frames, that went with it rather than stood still
     against: int = 0  # number of others inside its extent, added over frames, that rather stood still
-    moved: bool = False  # whether it has by its estimate, too, see `slam.bodies.estimator`: only then it is reported
     alike: int = 0  # number of frames in which it moved as an older body did, as a part of that would
     age: int = 0  # number of frames since it was found
     existence: float = EVEN  # probability that it exists, see `slam.bodies.belief`
@@ -131,7 +130,7 @@ def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_spe
         body = replace(body, known=np.zeros_like(body.known))  # the estimate began anew: it knows of no earlier pose
     return body.placed(
         estimate.T_world_object, slot, estimate.measured, covariance=estimate.covariance, velocity=v,
-        velocity_covariance=P, belief=belief, moved=body.moved or belief.moved,
+        velocity_covariance=P, belief=belief,
         moving=body.seen <= MIN_FRAMES or (certain and speed > min_speed), **changes,
     )  # fmt: skip
 
@@ -149,7 +148,7 @@ def continued(body: Body, known: Body) -> Body:
     return replace(
         body, id=known.id, T=frame, T_before=body.T_before @ change, history=body.history @ change,
         covariance=turn @ body.covariance @ turn.T, lower=corners.min(axis=0), upper=corners.max(axis=0),
-        certain=known.certain, moved=known.moved, existence=known.existence, evidence=known.evidence, age=known.age,
+        certain=known.certain, existence=known.existence, evidence=known.evidence, age=known.age,
         seen=body.seen + known.seen,
         agreeing=body.agreeing + known.agreeing, against=body.against + known.against,
         measured_at=known.measured_at, distinct=body.distinct | known.distinct, belief=None,
@@ -205,7 +204,7 @@ def reported(bodies: Mapping[int, Body], tracks: Tracks) -> tuple[MovingObject, 
     """The bodies that are worth reporting, by ascending id: if not measured, for a short while if they likely exist."""
     out = []
     for _, body in sorted(bodies.items()):
-        if body.belief is None or not (body.proven and body.moved):
+        if body.belief is None or not body.proven:
             continue
         e = body.belief.estimate
         short = e.stamp - body.measured_at <= _UNMEASURED and body.missed <= UNMEASURED_SHARE * body.seen

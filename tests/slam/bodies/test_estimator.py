@@ -59,7 +59,7 @@ def test_nees(make):
     pose, velocity = [], []
     for seed in range(SEEDS):
         scene = make(seed=seed, frames=10)
-        still = replace(scene.models.objects, drift=0.0)  # the simulated features do not drift
+        still = replace(scene.models.objects)  # the simulated features do not drift
         found = outcome(replace(scene, models=replace(scene.models, objects=still)), seed=seed)
         pose.append(found.pose_nees[[2, 4, 8]])
         velocity.append(found.velocity_nees[[2, 4, 8]])
@@ -72,7 +72,7 @@ def test_nees(make):
 def test_agrees_with_a_dense_solution_of_all_frames():
     """Poses and points of all frames at once, by scipy, with a known camera: what is marginalised loses nothing."""
     scene = box_scene(seed=3, frames=7, moving=False, points=8)
-    stereo, models = RectifiedStereo.of(scene.rig), replace(scene.models.objects, drift=0.0)
+    stereo, models = RectifiedStereo.of(scene.rig), replace(scene.models.objects)
     rng, estimator = np.random.default_rng(5), BodyEstimator(scene.rig, replace(scene.models, objects=models))
     first = se3.pose(np.eye(3), scene.points.mean(axis=0))
     belief, z = None, []
