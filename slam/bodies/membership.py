@@ -30,7 +30,9 @@ _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, befo
 _MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of both diagonals
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join
 _EDGE = 0.1  # share of its diagonal by which the extent is wider: the outermost points lie beyond the percentiles
-CLEAR = 6.0  #: χ² by which a track says for certain whose it is: 20 to 1; inside a body it is the body's unless it says so
+CLEAR = (
+    6.0  #: χ² by which a track says for certain whose it is: 20 to 1; inside a body it is the body's unless it says so
+)
 _MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
 _DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame

@@ -35,19 +35,14 @@ def test_a_wrong_pose_moves_nothing():
     assert found.alone.max() < 30  # χ²(3) of 80 points: 99.9999 %
 
 
-def test_the_near_group_is_found_though_the_pose_is_wrong():
-    moved, view = scene(shift=(0.006, 0.0, 0.0), pose_error=np.array([0.0, 0.02, 0.005, 0.02, 0.0, 0.01]))
+@pytest.mark.parametrize("pose_error", [(0.0, 0.02, 0.005, 0.02, 0.0, 0.01), (0.0, 0.0, 0.0, -0.006, 0.0, 0.0)])
+def test_the_near_group_is_found_though_the_pose_is_wrong(pose_error):
+    """Also where the pose follows the group, so that its points stand still and the wall is displaced."""
+    moved, view = scene(shift=(0.006, 0.0, 0.0), pose_error=pose_error)
     found = classify_scene(moved, view, 30.0)
     assert len(found.groups) == 1
     assert set(found.groups[0].members) <= set(range(12)) and len(found.groups[0].members) >= 10
     assert abs(found.groups[0].away - 0.006) < 0.002
-
-
-def test_where_the_near_group_rules_the_pose_it_is_still_the_one_that_moves():
-    """The pose follows the box, so that its own points stand still and the wall is displaced."""
-    moved, view = scene(shift=(0.006, 0.0, 0.0), pose_error=np.array([0.0, 0.0, 0.0, -0.006, 0.0, 0.0]))
-    found = classify_scene(moved, view, 30.0)
-    assert len(found.groups) == 1 and set(found.groups[0].members) <= set(range(12))
 
 
 def test_too_few_tracks_say_nothing():
@@ -63,19 +58,6 @@ def test_single_false_tracks_find_no_company():
     found = classify_scene(moved, view, 30.0)
     assert not found.groups
     assert set(np.flatnonzero(found.alone > 100)) == {20, 40, 60}
-
-
-def test_two_groups_that_move_differently_are_two():
-    moved, view = scene(count=120, near=12, shift=(0.006, 0.0, 0.0))
-    second = np.arange(12, 24)
-    moved.points[second] = np.column_stack([RNG.uniform(0.4, 0.5, (12, 2)), RNG.uniform(0.95, 1.05, 12)])
-    view[second] = np.column_stack(
-        [moved.points[second, :2] / moved.points[second, 2:], np.log(moved.points[second, 2])]
-    )
-    moved.d[second] += (0.0, -0.008, 0.0)
-    found = classify_scene(moved, view, 30.0)
-    assert len(found.groups) == 2
-    assert {frozenset(g.members <= 11) for g in found.groups} == {frozenset({True}), frozenset({False})}
 
 
 def test_where_errors_have_heavy_tails_a_small_group_that_agrees_by_chance_does_not_move():
