@@ -22,6 +22,7 @@ from slam.tracks.table import Tracks
 _UNMEASURED = 1.0  # [s] for which a body is still reported after its last measurement
 UNMEASURED_SHARE = 0.05  #: most frames in which it is so, as a share of those in which it was measured
 PROOF = 4  #: by frames that are certain by both tests, each of which counts twice, or by way and turn together
+CLEAR = 6.0  #: χ² by which a track says for certain whose it is: 20 to 1
 SOLID = 0.6  #: share of the points inside a body that go with it: where others stand still, a shadow or leaves move
 CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
@@ -64,6 +65,11 @@ class Body:
     def proven(self) -> bool:
         """Whether it has moved for certain by its tracks, and what it encloses has, for the most part."""
         return self.certain >= PROOF and self.agreeing >= SOLID * (self.agreeing + self.against)
+
+    @property
+    def solid(self) -> float:
+        """Twice the log odds, no more than is clear, that what is inside goes with it, by those that clearly did."""
+        return min(2.0 * math.log((self.agreeing + 1.0) / (self.against + 1.0)), CLEAR)
 
     @property
     def across(self) -> float:

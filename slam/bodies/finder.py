@@ -104,13 +104,11 @@ def moved_in(body: Body | None, tracks: Tracks, rows: IndexArray, frame: Frame) 
     t, ages, eyes, slide = tracks, frame.ages, frame.poses[:, :3, 3], frame.setup.slide
     rays = t.position[rows] - frame.eye
     if body is None:
-        older = t.older_A, t.older_b, t.older_age
-        return Displacements(rays, *displaced(t.A, t.p, t.dof, *older, rows, ages, _RECENT, rays, eyes, slide))
-    (points, A, known), n = in_body_axes(body, tracks, rows), len(rows)
-    none = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
+        return Displacements(rays, *displaced(t.A, t.p, t.dof, rows, ages, _RECENT, rays, eyes, slide))
+    points, A, known = in_body_axes(body, tracks, rows)
     dof, points = np.where(known, t.dof[rows], 0).astype(np.int8), np.where(known[..., None], points, 0.0)
     inside = (t.position[rows] - body.T[:3, 3]) @ body.T[:3, :3]
-    return Displacements(inside, *displaced(A, points, dof, *none, np.arange(n), ages, _RECENT, rays, eyes, 0.0))
+    return Displacements(inside, *displaced(A, points, dof, np.arange(len(rows)), ages, _RECENT, rays, eyes, 0.0))
 
 
 def known_well(tracks: Tracks, rows: IndexArray, T_world_left: Array) -> tuple[IndexArray, Array]:

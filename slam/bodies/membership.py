@@ -2,7 +2,7 @@
 
 A track's measurements are compared with a fixed point in the world and with a fixed point in the body. The difference
 of the two χ² over the window, a log-likelihood ratio, decides. What lies in the extent of an older body and went with
-it is a part of it; a young body that shows more of a thing than the older one takes that one's place.
+it is a part of it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from functools import cache
 
 import numpy as np
 
-from slam.bodies.bodies import Body, continued, in_body_axes, spread_of_place, with_extent
+from slam.bodies.bodies import CLEAR, Body, in_body_axes, spread_of_place, with_extent
 from slam.bodies.config import MIN_FRAMES, RUN, WINDOW
 from slam.bodies.fits import EXPLAINED, fit_positions, times_vectors
 from slam.bodies.frame import Frame
@@ -29,10 +29,6 @@ _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]
 _MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of both diagonals
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join
-_EDGE = 0.1  # share of its diagonal by which the extent is wider: the outermost points lie beyond the percentiles
-CLEAR = (
-    6.0  #: χ² by which a track says for certain whose it is: 20 to 1; inside a body it is the body's unless it says so
-)
 _MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
 _DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
@@ -133,12 +129,13 @@ def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: IndexArra
 
     And how many of them stand still inside it.
     """
-    inside = _distances(body, tracks, rows, _EDGE) < _NEAR
+    away = _distances(body, tracks, rows, 0.0)
+    inside = away < _NEAR
     proof = tracks.expelled[rows] | (not resolved)
     gain, fits, count = membership_test(body, tracks, rows)
-    better = gain > np.where(inside & ~proof, -CLEAR, CLEAR)
+    better = gain > np.where(inside & ~proof, -body.solid, CLEAR)
     joins = better & fits & (count >= np.where(proof, MIN_FRAMES, 2)) & ~tracks.still[rows]
-    against = (_distances(body, tracks, rows, 0.0) == 0.0) & (gain < -CLEAR)
+    against = (away == 0.0) & (gain < -CLEAR)
     return np.where(joins, gain, -np.inf), int(against.sum())
 
 
@@ -180,9 +177,9 @@ def tracks_on_bodies(bodies: Mapping[int, Body], tracks: Tracks) -> tuple[IndexA
             continue
         close = free[_distances(body, tracks, free, MARGIN) < _NEAR]
         near[close] = True
-        inside = close[_distances(body, tracks, close, _EDGE) < _NEAR]
+        inside = close[_distances(body, tracks, close, 0.0) < _NEAR]
         if len(inside) and body.proven:
-            asked = np.where(tracks.expelled[inside], CLEAR, -CLEAR)
+            asked = np.where(tracks.expelled[inside], CLEAR, -body.solid)
             on[inside[membership_test(body, tracks, inside)[0] > asked]] = True
     return np.flatnonzero(on), np.flatnonzero(near & ~on)
 
@@ -288,13 +285,8 @@ def merge(bodies: dict[int, Body], tracks: Tracks) -> None:
         body = bodies[id] = replace(body, alike=0 if whole is None else body.alike + 1)
         if whole is None or not (body.alike > 2 * WINDOW or (body.seen < 2 * WINDOW and whole.id != body.apart_from)):
             continue
-        theirs = _members(tracks, whole.id)
-        if len(theirs) >= len(mine):
-            add_members(whole, tracks, mine, sure=True)
-            tracks.give_up(np.flatnonzero(tracks.body == id))
-        else:
-            bodies[whole.id] = _in_place_of(whole, body, theirs, tracks)
-            tracks.body[tracks.body == id] = whole.id
+        add_members(whole, tracks, mine, sure=True)
+        tracks.give_up(np.flatnonzero(tracks.body == id))
         del bodies[id]
 
 
@@ -314,18 +306,6 @@ def _apart(body: Body, mine: IndexArray, other: Body, theirs: IndexArray, tracks
         return 1.0
     apart = distinctness(body, mine, other, theirs, tracks)
     return apart if explained else max(apart, 1.0)
-
-
-def _in_place_of(known: Body, body: Body, mine: IndexArray, tracks: Tracks) -> Body:
-    """A body under the id of a known one that is a part of it; its seen members `mine` go over."""
-    tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.found))
-    grown = continued(body, known)
-    own, change = tracks.body == body.id, inverse(grown.T) @ body.T
-    R = change[:3, :3]
-    tracks.local[own] = transform(change, tracks.local[own])
-    tracks.local_information[own] = R @ tracks.local_information[own] @ R.T
-    add_members(grown, tracks, mine, sure=True)
-    return grown
 
 
 def _members(tracks: Tracks, id: int) -> IndexArray:
