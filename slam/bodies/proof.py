@@ -31,10 +31,7 @@ from slam.bodies.scene_kernels import MEDIAN, PRIOR
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, inverse, points_by_pose
 
-PROVEN = 12.0  #: −log10 of the chance from which a body has moved for certain if it went farther than the camera; at 8
-#: the same bodies are found in `boxes` and on drives, and twice as many pieces of a walker
-_SLIDES = 20.0  # the same elsewhere: what slides with the camera was seen to agree by up to some 1e-19
-_FARTHER = 2.0  # times the camera's way; from 2 to 4 nothing changes, at 1 what slides in EuRoC MH_01 is a body
+PROVEN = 20.0  #: −log10 of the chance from which a frame proves a motion: what slides was seen to agree by 1e-19
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
 _MOST = 40.0  # numerics: of the evidence of a frame
 _WEAK = 1e-9  # numerics: of variance [m²]
@@ -68,12 +65,6 @@ class Way:
         by_rig = (off[-1] - off[0]) / max(len(seen) - 1, 1)
         return cls(places, stamps[seen], by_rig, cameras[seen, :3, 3])
 
-    @property
-    def far(self) -> bool:
-        """Whether it is longer than that of the camera by far: what slides does not go so far."""
-        went = np.linalg.norm(np.ptp(self.places, axis=0), axis=1).max()
-        return bool(went > _FARTHER * np.linalg.norm(np.ptp(self.cameras, axis=0)))
-
     def beside_camera(self) -> Array:
         """The places (K, 4, 3) less the share of the camera's way, 0 to 1, that is most like the way of their middle.
 
@@ -84,23 +75,19 @@ class Way:
         return np.asarray(self.places - np.clip(share, 0.0, 1.0) * camera)
 
 
-def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, int]:
-    """The evidence that a body moves still, after one more frame, and what this frame counts for its `PROOF`.
+def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, bool]:
+    """The evidence that a body moves still, after one more frame, and whether this frame proves that it has moved.
 
     The evidence is a cumulative sum of −log10 of the chance that the weaker test gives; it fades while a body rests.
     For a body that was followed `far`, for farther than it is wide, its way alone counts.
     """
-    places = way.places if far else way.beside_camera()
-    says, turns, enough = _by_frames(places, way.times), 0.0, len(moved.d) >= MIN_POINTS
-    if enough and not far:
+    says, turns = _by_frames(way.places if far else way.beside_camera(), way.times), 0.0
+    if len(moved.d) < MIN_POINTS:
+        return evidence, far and says >= PROVEN
+    if not far:
         by_members, turns = _by_members(moved, scene, way.by_rig)
         says = min(says, by_members)
-    if enough:
-        evidence = max(0.0, evidence + says - _ALLOWANCE)
-    bar = PROVEN if way.far else _SLIDES
-    if not (enough or far) or says < max(0.5 * PROVEN, bar - turns):
-        return evidence, 0
-    return evidence, 2 if says >= PROVEN else 1
+    return max(0.0, evidence + says - _ALLOWANCE), says >= max(0.5 * PROVEN, PROVEN - turns)
 
 
 def _evidence(chance: float) -> float:
