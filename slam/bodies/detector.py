@@ -253,8 +253,8 @@ class MovingObjectDetector(ObjectDetector):
             members = members[tracks.count(members) >= MIN_FRAMES - 1]
             scene = scenes[None if whole is None else whole.id]
             moved, way = finder.moved_in(whole, tracks, members, frame), Way.of(body, frame, whole)
-            evidence, proves = with_frame(body.evidence, moved, scene, way, body.far)
-            body = replace(body, evidence=evidence, certain=body.certain + proves)
+            evidence, counts = with_frame(body.evidence, moved, scene, way, body.far)
+            body = replace(body, evidence=evidence, certain=body.certain + counts)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= WINDOW:
                 self._drop(tracks, body)

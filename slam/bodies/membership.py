@@ -29,6 +29,7 @@ _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]
 _MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of both diagonals
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join
+_LOOSE = 4.0  # times the 99 % limit that the χ² of a member may be whose motion is explained for the most part
 _MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
 _DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
@@ -43,7 +44,7 @@ def membership_test(body: Body, tracks: Tracks, rows: IndexArray) -> tuple[Array
     dof = np.where(known, tracks.dof[rows], 0)
     fixed, still, count = squares(points, A), _still(tracks, rows, known), known.sum(axis=1)
     limit = _limits(3 * dof.shape[1])[np.maximum(dof.sum(axis=1) - 3, 1)]
-    fits = fixed < np.maximum(limit, EXPLAINED * still)
+    fits = (fixed < limit) | ((fixed < EXPLAINED * still) & (fixed < _LOOSE * limit))
     return still - fixed, fits, count
 
 

@@ -31,7 +31,9 @@ from slam.bodies.scene_kernels import MEDIAN, PRIOR
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, inverse, points_by_pose
 
-PROVEN = 20.0  #: −log10 of the chance from which a frame proves a motion: what slides was seen to agree by 1e-19
+PROVEN = 12.0  #: −log10 of the chance from which a frame proves that a body moves that went farther than the camera
+_SLIDES = 25.0  # the same elsewhere: what slides with the camera was seen to agree by up to 1e-21
+_FARTHER = 2.0  # times the camera's way; from 2 to 4 nothing changes, at 1 what slides in EuRoC MH_01 is a body
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
 _MOST = 40.0  # numerics: of the evidence of a frame
 _WEAK = 1e-9  # numerics: of variance [m²]
@@ -65,6 +67,12 @@ class Way:
         by_rig = (off[-1] - off[0]) / max(len(seen) - 1, 1)
         return cls(places, stamps[seen], by_rig, cameras[seen, :3, 3])
 
+    @property
+    def bar(self) -> float:
+        """−log10 of the chance from which it is certain: what slides does not go farther than the camera by far."""
+        went = np.linalg.norm(np.ptp(self.places, axis=0), axis=1).max()
+        return PROVEN if went > _FARTHER * np.linalg.norm(np.ptp(self.cameras, axis=0)) else _SLIDES
+
     def beside_camera(self) -> Array:
         """The places (K, 4, 3) less the share of the camera's way, 0 to 1, that is most like the way of their middle.
 
@@ -75,19 +83,20 @@ class Way:
         return np.asarray(self.places - np.clip(share, 0.0, 1.0) * camera)
 
 
-def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, bool]:
-    """The evidence that a body moves still, after one more frame, and whether this frame proves that it has moved.
+def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, int]:
+    """The evidence that a body moves still, after one more frame, and what this frame counts for its `PROOF`.
 
     The evidence is a cumulative sum of −log10 of the chance that the weaker test gives; it fades while a body rests.
     For a body that was followed `far`, for farther than it is wide, its way alone counts.
     """
-    says, turns = _by_frames(way.places if far else way.beside_camera(), way.times), 0.0
+    says, turns, bar = _by_frames(way.places if far else way.beside_camera(), way.times), 0.0, way.bar
     if len(moved.d) < MIN_POINTS:
-        return evidence, far and says >= PROVEN
+        return evidence, 2 * (far and says >= bar)
     if not far:
         by_members, turns = _by_members(moved, scene, way.by_rig)
         says = min(says, by_members)
-    return max(0.0, evidence + says - _ALLOWANCE), says >= max(0.5 * PROVEN, PROVEN - turns)
+    counts = 0 if says < max(0.5 * PROVEN, bar - turns) else 2 if says >= PROVEN else 1
+    return max(0.0, evidence + says - _ALLOWANCE), counts
 
 
 def _evidence(chance: float) -> float:
