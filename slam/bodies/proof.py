@@ -32,7 +32,7 @@ from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, inverse, points_by_pose
 
 PROVEN = 12.0  #: −log10 of the chance from which a frame proves that a body moves that went farther than the camera
-_SLIDES = 25.0  # the same elsewhere: what slides with the camera was seen to agree by up to 1e-21
+_SLIDES = 20.0  # the same elsewhere: what slides with the camera was seen to agree by up to 1e-16
 _FARTHER = 2.0  # times the camera's way; from 2 to 4 nothing changes, at 1 what slides in EuRoC MH_01 is a body
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
 _MOST = 40.0  # numerics: of the evidence of a frame
