@@ -256,7 +256,7 @@ class MovingObjectDetector(ObjectDetector):
             evidence, counts = with_frame(body.evidence, moved, scene, way, body.far)
             body = replace(body, evidence=evidence, certain=body.certain + counts)
             self.bodies[body.id] = body
-            if evidence == 0.0 if body.proven else body.seen >= WINDOW:
+            if evidence == 0.0 if body.proven else body.seen >= 2 * WINDOW:  # the first holds how it started
                 self._drop(tracks, body)
 
     def _drop(self, tracks: Tracks, body: Body) -> None:
