@@ -150,8 +150,8 @@ FAULTS = (
     ),
     # moving bodies
     Fault(
-        "what goes a share of the camera's way has moved for certain", "slam/bodies/proof.py",
-        "np.clip(share, 0.0, 1.0)", "0.0",
+        "what slides with the camera has moved for certain", "slam/bodies/proof.py",
+        "_FARTHER * np", "0.0 * np",
         "tests/slam/bodies/test_proof.py tests/slam/bodies",
     ),
     Fault(
