@@ -75,7 +75,6 @@ class Points:
     local: Array  # covariance (N, 3, 3) [m²] in the coordinates of the newest camera, by which they are known
     failures: IdArray  # how often running each was rejected (N,)
     unseen: IdArray  # frames since each was seen (N,)
-    sights: IdArray  # frames in which each was used (N,)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -84,7 +83,7 @@ class Points:
     def new(cls, ids: IdArray, position: Array, local: Array) -> Points:
         """Points at their first sight."""
         none = np.zeros(len(ids), np.int64)
-        return cls(ids, position, local, none, none, none + 1)
+        return cls(ids, position, local, none, none)
 
     def joined(self, other: Points) -> Points:
         """These and others."""

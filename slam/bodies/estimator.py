@@ -228,14 +228,14 @@ class BodyEstimator:
     def _after(self, b: BodyBelief, solution: Solution, local: Array, rows: IndexArray, used: BoolArray) -> BodyBelief:
         """The belief at a solution; points that failed too often are given up."""
         p = b.points
-        failures, unseen, sights, ids = p.failures.copy(), p.unseen.copy(), p.sights.copy(), p.ids.copy()
+        failures, unseen, ids = p.failures.copy(), p.unseen.copy(), p.ids.copy()
         failures[rows] = np.where(used, 0, failures[rows] + 1)
-        unseen[rows], sights[rows] = 0, sights[rows] + used
+        unseen[rows] = 0
         ids[failures >= RUN] = -1
         w = solution.window
         return replace(
             b, poses=w.poses, covariance=solution.pose_covariance,
-            points=replace(p, ids=ids, position=w.points, local=local, failures=failures, unseen=unseen, sights=sights),
+            points=replace(p, ids=ids, position=w.points, local=local, failures=failures, unseen=unseen),
         )  # fmt: skip
 
     def _joined(self, b: BodyBelief, seen: _Seen, new: BoolArray) -> tuple[BodyBelief, IndexArray]:
