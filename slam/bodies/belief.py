@@ -9,21 +9,18 @@ world.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam.bodies.config import MIN_POINTS
 from slam.data import BoolArray, IdArray, RecentPoses
 from slam.geometry.se3 import Array, transform
 from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate
 from slam.window.marginal import marginalised
-from slam.window.problem import Motion, Places, RelativePrior, Rows, Window
+from slam.window.problem import Motion, RelativePrior, Rows, Window
 from slam.window.stereo import RectifiedStereo
 
-Projection = Callable[[Array], tuple[Array, Array]]
 EVEN = 0.5  #: fixed: a body rather exists than not above this probability, which it has before its first evidence
 _LEAST = 2.0  # ratio of the likelihoods of a measured body, at least: a body at rest shows no motion, but is there
 _LARGEST = 20.0  # χ² that counts of the typical member: many members share one error of the camera's pose
@@ -31,7 +28,6 @@ _CERTAIN = 1.0 - 1e-9  # a probability of 1 could never fall again
 
 
 _FAR = 3.0  # so many times the median distance from the median point is no part of the body
-_STEPS = 3  # numerics: of Gauss-Newton; the prior is weak where depth is known well
 
 
 def compact(points: Array) -> BoolArray:
@@ -55,52 +51,6 @@ def first_frame(T_world_left: Array, h: Array) -> tuple[Array, BoolArray]:
     return T, near
 
 
-@dataclass(frozen=True, eq=False)
-class Shape:
-    """Where the points of a body lie: a Gaussian with mean (3,) and covariance (3, 3) in some frame."""
-
-    mean: Array
-    covariance: Array
-
-    def seen_from(self, T: Array) -> Shape:
-        """The same in another frame, to which T (4, 4) takes coordinates."""
-        R = T[:3, :3]
-        return Shape(R @ self.mean + T[:3, 3], R @ self.covariance @ R.T)
-
-
-def shape_of(points: Array, covariances: Array) -> Shape:
-    """The spread of a body's points (M, 3), less what their uncertainties (M, 3, 3) make it seem larger.
-
-    No extent is taken to be less than half the middle one: a body is seldom flatter than that, and would be taken for
-    flat wrongly where depth is all noise. Fewer than four points show no shape: then next to nothing is said.
-    """
-    if len(points) < MIN_POINTS:
-        return Shape(points.mean(axis=0), 100 * covariances.mean(axis=0))
-    mean, noise = points.mean(axis=0), covariances.mean(axis=0)
-    offset = points - mean
-    total = offset.T @ offset / max(1, len(points) - 1)
-    values, axes = np.linalg.eigh(total - noise)
-    least = max(values[1] / 4, 1e-4 * float(np.trace(total)), 1e-3 * float(np.trace(noise)))
-    return Shape(mean, (axes * np.maximum(values, least)) @ axes.T)
-
-
-def with_shape(project: Projection, z: Array, h: Array, sigma: float, shape: Shape) -> tuple[Array, Array]:
-    """Points (M, 3) by pixels z (M, 3), given that they belong to a body of known shape, and their covariances.
-
-    All in left-camera coordinates. Far off, stereo scatters the points of a body further in depth than the body is
-    deep, so that a turn would seem much better visible than it is. With the shape as prior each point is drawn to the
-    others as far as its depth is noise. `h` is where they triangulate to.
-    """
-    prior = np.linalg.inv(shape.covariance)
-    for _ in range(_STEPS):
-        predicted, J = project(h)
-        weight = np.swapaxes(J, 1, 2) / sigma**2
-        covariance = np.linalg.inv(weight @ J + prior)
-        gradient = (weight @ (z - predicted)[:, :, None])[:, :, 0] + (shape.mean - h) @ prior
-        h = h + (covariance @ gradient[:, :, None])[:, :, 0]
-    return h, covariance
-
-
 def when_measured(probability: float, gain: float) -> float:
     """The probability after a frame that measured the body, which explains a member better than the world by `gain`."""
     ratio = max(_LEAST, math.exp(0.5 * min(gain, _LARGEST)))
@@ -114,7 +64,6 @@ def when_missed(probability: float, seen: int, age: int) -> float:
 
 
 _EXACT = 1e-12 * np.eye(6)  # numerics: [rad², m²]
-_TURN = 0.01  # cost: a point is seen from elsewhere by no less [rad]; what is less adds up
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,18 +75,15 @@ class Points:
     local: Array  # covariance (N, 3, 3) [m²] in the coordinates of the newest camera, by which they are known
     failures: IdArray  # how often running each was rejected (N,)
     unseen: IdArray  # frames since each was seen (N,)
-    sights: IdArray  # frames in which each was used (N,)
-    first: Array  # direction (N, 3) from which each was seen first, in body coordinates
-    turned: Array  # largest angle between that and later ones (N,) [rad], as far as it is allowed for
 
     def __len__(self) -> int:
         return len(self.ids)
 
     @classmethod
-    def new(cls, ids: IdArray, position: Array, local: Array, eye: Array) -> Points:
-        """Points at their first sight, from `eye` (3,)."""
+    def new(cls, ids: IdArray, position: Array, local: Array) -> Points:
+        """Points at their first sight."""
         none = np.zeros(len(ids), np.int64)
-        return cls(ids, position, local, none, none, none + 1, _directions(position, eye), np.zeros(len(ids)))
+        return cls(ids, position, local, none, none)
 
     def joined(self, other: Points) -> Points:
         """These and others."""
@@ -154,7 +100,6 @@ class BodyBelief:
 
     since: float  # when the estimate began [s]
     T_begun: Array  # pose T_world_object (4, 4) then
-    moved: bool  # whether it has moved for certain since
     # what was known of the velocity [ω, v] (6,) in the first interval: mean, in world axes, and standard deviations
     velocity: Array
     sigmas: Array
@@ -163,7 +108,6 @@ class BodyBelief:
     scales: Array  # factors (K,) on the impulse before each frame
     points: Points  # of the body
     rows: Rows  # what was measured of them in these frames
-    places: Places  # what is known of points besides, from a frame
     prior: RelativePrior  # what earlier frames say of the poses and points
     covariance: Array  # of the poses together (6 K, 6 K), perturbed on the right
     estimate: ObjectEstimate  # of the newest frame, as it is reported
@@ -177,19 +121,13 @@ class BodyBelief:
         return np.asarray(self.points.ids >= 0)
 
 
-def _directions(points: Array, eye: Array) -> Array:
-    """Unit vectors (N, 3) from points (N, 3) towards the camera's place (3,)."""
-    d = eye - points
-    return np.asarray(d / np.linalg.norm(d, axis=1)[:, None])
-
-
 def begun(stamp: float, T_body_left: Array, velocity: Array, sigmas: Array, estimate: ObjectEstimate) -> BodyBelief:
     """A belief without points: the body's frame is put at T_body_left (4, 4) from the camera, by definition."""
     none = np.zeros((0, 3))
-    points = Points.new(np.zeros(0, np.int64), none, np.zeros((0, 3, 3)), np.zeros(3))
+    points = Points.new(np.zeros(0, np.int64), none, np.zeros((0, 3, 3)))
     return BodyBelief(
-        stamp, estimate.T_world_object, False, velocity, sigmas, np.array([stamp]), T_body_left[None], np.ones(1),
-        points, Rows.none(), Places.none(), RelativePrior.of_pose(T_body_left, _EXACT), _EXACT, estimate,
+        stamp, estimate.T_world_object, velocity, sigmas, np.array([stamp]), T_body_left[None], np.ones(1),
+        points, Rows.none(), RelativePrior.of_pose(T_body_left, _EXACT), _EXACT, estimate,
     )  # fmt: skip
 
 
@@ -219,61 +157,26 @@ def carried(b: BodyBelief, cameras: RecentPoses, models: ObjectModels) -> Motion
 
 def window(b: BodyBelief, stereo: RectifiedStereo, motion: Motion) -> Window:
     """The belief as a problem for the solver."""
-    return Window(stereo, b.poses, b.points.position, b.rows, places=b.places, motion=motion, prior=b.prior)
+    return Window(stereo, b.poses, b.points.position, b.rows, motion=motion, prior=b.prior)
 
 
-def slid(b: BodyBelief, stereo: RectifiedStereo, motion: Motion, drift: float) -> BodyBelief:
+def slid(b: BodyBelief, stereo: RectifiedStereo, motion: Motion) -> BodyBelief:
     """The belief without its oldest frame, which becomes part of the prior with the points that it has measured.
 
-    `drift` is the density of the random walk of a point's direction with the angle of view [rad / √rad]. Raises
-    LinAlgError where the information of what leaves is not positive definite.
+    Raises LinAlgError where the information of what leaves is not positive definite.
     """
-    rows, places = b.rows, b.places
-    member, here, alive = np.zeros(len(b.points), bool), np.zeros(len(b.points), bool), b.alive
+    rows, member, here = b.rows, np.zeros(len(b.points), bool), np.zeros(len(b.points), bool)
     member[b.prior.points], here[rows.point[rows.pose == 0]] = True, True
-    here[places.point[places.pose == 0]] = True
-    joins, ends = here & ~member & alive, member & ~alive
+    joins, ends = here & ~member & b.alive, member & ~b.alive
     taken = (rows.pose == 0) & (member | joins)[rows.point] | ends[rows.point]
-    there = (places.pose == 0) & (member | joins)[places.point] | ends[places.point]
     w = window(b, stereo, motion.select(np.flatnonzero((motion.poses <= 0).any(axis=1))))
-    w = Window(
-        stereo, w.poses, w.points, rows.select(taken), places=places.select(there), motion=w.motion, prior=b.prior,
-        joining=np.flatnonzero(joins),
-    )  # fmt: skip
+    w = replace(w, rows=rows.select(taken), joining=np.flatnonzero(joins))
     prior, _, _ = marginalised(w, [0], ends[b.prior.points])
-    prior, turned = _drifted(prior, b, drift)
-    rows, places = rows.select(~taken & (rows.pose > 0)), places.select(~there & (places.pose > 0))
-    keep = member & alive | joins
-    keep[rows.point] = keep[places.point] = True
+    rows, keep = rows.select(~taken & (rows.pose > 0)), member & b.alive | joins
+    keep[rows.point] = True
     index = np.cumsum(keep) - 1
     return replace(
-        b, stamps=b.stamps[1:], poses=b.poses[1:], scales=b.scales[1:],
-        points=replace(b.points, turned=turned).select(keep),
+        b, stamps=b.stamps[1:], poses=b.poses[1:], scales=b.scales[1:], points=b.points.select(keep),
         rows=replace(rows, pose=rows.pose - 1, point=index[rows.point]),
-        places=replace(places, pose=places.pose - 1, point=index[places.point]),
         prior=replace(prior, points=index[prior.points]), covariance=b.covariance[6:, 6:],
     )  # fmt: skip
-
-
-def _drifted(prior: RelativePrior, b: BodyBelief, density: float) -> tuple[RelativePrior, Array]:
-    """The prior with its points less certain across the line of sight, and the angles (N,) allowed for now.
-
-    A feature is found where the image looks like it; seen from farther round than ever before, that is elsewhere on the
-    body. The first two coordinates of a point in its chart are its direction.
-    """
-    p = b.points
-    cosine = np.einsum("ni,ni->n", p.first, _directions(p.position, b.poses[-1][:3, 3]))
-    turned = np.maximum(p.turned, np.arccos(np.clip(cosine, -1, 1)))
-    more = (turned - p.turned)[prior.points]
-    far = np.flatnonzero(more > _TURN)
-    if not len(far) or not density:
-        return prior, p.turned
-    out = p.turned.copy()
-    out[prior.points[far]] = turned[prior.points[far]]
-    at = (3 * far[:, None] + np.arange(2)).reshape(-1)
-    S = np.diag(1.0 / np.repeat(density**2 * more[far], 2)) + prior.information[np.ix_(at, at)]
-    gain = np.linalg.solve(S, prior.information[at]).T
-    information = prior.information - gain @ prior.information[at]
-    return replace(
-        prior, information=0.5 * (information + information.T), vector=prior.vector - gain @ prior.vector[at]
-    ), out

@@ -22,6 +22,7 @@ from slam.tracks.table import Tracks
 _UNMEASURED = 1.0  # [s] for which a body is still reported after its last measurement
 UNMEASURED_SHARE = 0.05  #: most frames in which it is so, as a share of those in which it was measured
 PROOF = 4  #: by frames that are certain by both tests, each of which counts twice, or by way and turn together
+CLEAR = 6.0  #: χ² by which a track says for certain whose it is: 20 to 1
 SOLID = 0.6  #: share of the points inside a body that go with it: where others stand still, a shadow or leaves move
 CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
@@ -52,7 +53,6 @@ class Body:
     certain: int = 0  # what frames so far count for the proof that it moves, see `slam.bodies.proof`
     agreeing: int = 0  # number of members, added over frames, that went with it rather than stood still
     against: int = 0  # number of others inside its extent, added over frames, that rather stood still
-    moved: bool = False  # whether it has by its estimate, too, see `slam.bodies.estimator`: only then it is reported
     alike: int = 0  # number of frames in which it moved as an older body did, as a part of that would
     age: int = 0  # number of frames since it was found
     existence: float = EVEN  # probability that it exists, see `slam.bodies.belief`
@@ -65,6 +65,11 @@ class Body:
     def proven(self) -> bool:
         """Whether it has moved for certain by its tracks, and what it encloses has, for the most part."""
         return self.certain >= PROOF and self.agreeing >= SOLID * (self.agreeing + self.against)
+
+    @property
+    def solid(self) -> float:
+        """Twice the log odds, no more than is clear, that what is inside goes with it, by those that clearly did."""
+        return min(2.0 * math.log((self.agreeing + 1.0) / (self.against + 1.0)), CLEAR)
 
     @property
     def across(self) -> float:
@@ -131,7 +136,7 @@ def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_spe
         body = replace(body, known=np.zeros_like(body.known))  # the estimate began anew: it knows of no earlier pose
     return body.placed(
         estimate.T_world_object, slot, estimate.measured, covariance=estimate.covariance, velocity=v,
-        velocity_covariance=P, belief=belief, moved=body.moved or belief.moved,
+        velocity_covariance=P, belief=belief,
         moving=body.seen <= MIN_FRAMES or (certain and speed > min_speed), **changes,
     )  # fmt: skip
 
@@ -149,7 +154,7 @@ def continued(body: Body, known: Body) -> Body:
     return replace(
         body, id=known.id, T=frame, T_before=body.T_before @ change, history=body.history @ change,
         covariance=turn @ body.covariance @ turn.T, lower=corners.min(axis=0), upper=corners.max(axis=0),
-        certain=known.certain, moved=known.moved, existence=known.existence, evidence=known.evidence, age=known.age,
+        certain=known.certain, existence=known.existence, evidence=known.evidence, age=known.age,
         seen=body.seen + known.seen,
         agreeing=body.agreeing + known.agreeing, against=body.against + known.against,
         measured_at=known.measured_at, distinct=body.distinct | known.distinct, belief=None,
@@ -205,7 +210,7 @@ def reported(bodies: Mapping[int, Body], tracks: Tracks) -> tuple[MovingObject, 
     """The bodies that are worth reporting, by ascending id: if not measured, for a short while if they likely exist."""
     out = []
     for _, body in sorted(bodies.items()):
-        if body.belief is None or not (body.proven and body.moved):
+        if body.belief is None or not body.proven:
             continue
         e = body.belief.estimate
         short = e.stamp - body.measured_at <= _UNMEASURED and body.missed <= UNMEASURED_SHARE * body.seen

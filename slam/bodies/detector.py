@@ -9,6 +9,7 @@ import numpy as np
 
 from slam.bodies import finder, membership
 from slam.bodies.bodies import (
+    CLEAR,
     Body,
     advanced,
     continued,
@@ -215,7 +216,7 @@ class MovingObjectDetector(ObjectDetector):
         for id, body in list(self.bodies.items()):
             gains, against = said.get(id, (np.zeros(0), 0))
             typical = median(gains) if len(gains) else 0.0
-            body = self.bodies[id] = with_evidence(body, typical, int((gains > membership.CLEAR).sum()), against)
+            body = self.bodies[id] = with_evidence(body, typical, int((gains > CLEAR).sum()), against)
             if id in said and typical <= 0 and not body.proven:
                 self._drop(tracks, body)
             elif id in said:
@@ -255,7 +256,7 @@ class MovingObjectDetector(ObjectDetector):
             evidence, counts = with_frame(body.evidence, moved, scene, way, body.far)
             body = replace(body, evidence=evidence, certain=body.certain + counts)
             self.bodies[body.id] = body
-            if evidence == 0.0 if body.proven else body.seen >= WINDOW:
+            if evidence == 0.0 if body.proven else body.seen >= 2 * WINDOW:  # the first holds how it started
                 self._drop(tracks, body)
 
     def _drop(self, tracks: Tracks, body: Body) -> None:

@@ -17,14 +17,11 @@ import numpy as np
 from slam.bodies.belief import (
     BodyBelief,
     Points,
-    Shape,
     begun,
     carried,
     first_frame,
-    shape_of,
     slid,
     window,
-    with_shape,
 )
 from slam.bodies.config import MIN_POINTS, RUN
 from slam.chi_square import chi_square_limit, chi_square_limits
@@ -34,15 +31,14 @@ from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, log, pose, so3_exp, so3_left_jacobian, so3_log, transform
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
-from slam.window import chart_kernels, pose_only
+from slam.window import pose_only
 from slam.window.gating import INFLATION
-from slam.window.problem import Places, Rows
+from slam.window.problem import Rows
 from slam.window.solver import Solution, linearised, solve
 from slam.window.stereo import RectifiedStereo
 
 FRAMES = 4  #: cost: frames of a window; older ones are marginalised
 _SOLVED_AGAIN = 4  # numerics: how often it is solved again without observations that disagree with the others
-_CHANCE = 1e-6  # that a body at rest seems to have moved; from 1e-4 to 1e-12 next to nothing changes
 _LEAST = 2  # points that must agree with a body that has more: one agrees with some pose always
 
 
@@ -75,7 +71,6 @@ class BodyEstimator:
         self.sigma = models.pixel_sigma
         self.models = models.objects
         self.gate = models.gate_probability
-        self.drift = self.models.drift / self.stereo.f
 
     def updated(
         self, belief: BodyBelief | None, id: int, seen: ObjectObservations | None, cameras: RecentPoses
@@ -120,7 +115,7 @@ class BodyEstimator:
         cameras = _of(cameras, np.append(b.stamps, cameras.stamps[-1]))
         earlier = _of(cameras, b.stamps)
         if len(b) >= FRAMES:
-            b = slid(b, self.stereo, carried(b, earlier, self.models), self.drift)
+            b = slid(b, self.stereo, carried(b, earlier, self.models))
             cameras, earlier = _of(cameras, cameras.stamps[1:]), _of(cameras, b.stamps)
         expected = self._expected(b, cameras)
         rejected = none = np.zeros(0, np.int64)
@@ -141,8 +136,6 @@ class BodyEstimator:
         b, joined = self._joined(b, seen, ~isin(seen.given.points, np.concatenate([used, rejected])))
         good = np.sort(np.concatenate([used, seen.given.points[joined]]))
         after = self._reported(b, id, cameras, True, good, np.sort(rejected))
-        if len(used) >= MINIMAL_POINTS and not after.moved:
-            after = replace(after, moved=_has_moved(after))
         e, last, dt = after.estimate, before.estimate, float(b.stamps[-1] - b.stamps[-2])
         possible = self.models.possible(
             e.velocity, e.velocity_covariance, last.velocity, last.velocity_covariance, dt
@@ -235,14 +228,14 @@ class BodyEstimator:
     def _after(self, b: BodyBelief, solution: Solution, local: Array, rows: IndexArray, used: BoolArray) -> BodyBelief:
         """The belief at a solution; points that failed too often are given up."""
         p = b.points
-        failures, unseen, sights, ids = p.failures.copy(), p.unseen.copy(), p.sights.copy(), p.ids.copy()
+        failures, unseen, ids = p.failures.copy(), p.unseen.copy(), p.ids.copy()
         failures[rows] = np.where(used, 0, failures[rows] + 1)
-        unseen[rows], sights[rows] = 0, sights[rows] + used
+        unseen[rows] = 0
         ids[failures >= RUN] = -1
         w = solution.window
         return replace(
             b, poses=w.poses, covariance=solution.pose_covariance,
-            points=replace(p, ids=ids, position=w.points, local=local, failures=failures, unseen=unseen, sights=sights),
+            points=replace(p, ids=ids, position=w.points, local=local, failures=failures, unseen=unseen),
         )  # fmt: skip
 
     def _joined(self, b: BodyBelief, seen: _Seen, new: BoolArray) -> tuple[BodyBelief, IndexArray]:
@@ -257,26 +250,14 @@ class BodyEstimator:
             return b, which
         ids = b.points.ids.copy()
         ids[gone] = -1
-        Y = b.poses[-1]
-        shape = self._shape(b, seen.local[which]).seen_from(inverse(Y))
-        h, own = with_shape(self.stereo.project, seen.z[which], seen.local[which], self.sigma, shape)
-        new_points = Points.new(seen.given.points[which], transform(Y, h), own, Y[:3, 3])
+        h = seen.local[which]
+        own = self.stereo.rig.triangulation_covariance(h, self.sigma)
+        new_points = Points.new(seen.given.points[which], transform(b.poses[-1], h), own)
         at = len(ids) + np.arange(len(which))
         points = replace(b.points, ids=ids).joined(new_points)
         return replace(
-            b, points=points, rows=b.rows.joined(self._rows(len(b) - 1, at, seen.z[which])),
-            places=b.places.joined(_places(len(b) - 1, at, h, shape)),
+            b, points=points, rows=b.rows.joined(self._rows(len(b) - 1, at, seen.z[which]))
         ), which  # fmt: skip
-
-    def _shape(self, b: BodyBelief, h: Array) -> Shape:
-        """The body's shape in body coordinates, by the points it has, or else by the new ones at h (M, 3)."""
-        Y, alive = b.poses[-1], b.alive
-        if alive.sum() >= MIN_POINTS:
-            R = Y[:3, :3]
-            return shape_of(b.points.position[alive], R @ b.points.local[alive] @ R.T)
-        _, J = self.stereo.project(h)
-        back = np.linalg.inv(J) * self.sigma
-        return shape_of(h, back @ np.swapaxes(back, 1, 2)).seen_from(Y)
 
     def _rows(self, frame: int, points: IndexArray, z: Array) -> Rows:
         return Rows.of(frame, points, z, self.sigma)
@@ -304,12 +285,6 @@ class BodyEstimator:
         return replace(b, estimate=estimate)
 
 
-def _has_moved(b: BodyBelief) -> bool:
-    """Whether the motion since the estimate began is more than the uncertainty of body and camera makes it seem."""
-    change = log(inverse(b.T_begun) @ b.estimate.T_world_object)
-    return bool(change @ np.linalg.solve(b.estimate.covariance, change) > chi_square_limit(6, 1 - _CHANCE))
-
-
 def _of(cameras: RecentPoses, stamps: Array) -> RecentPoses:
     """The camera's poses at some of their stamps (K,), ascending; LinAlgError where one of them is not there."""
     at = np.searchsorted(cameras.stamps, stamps).clip(0, len(cameras) - 1)
@@ -325,18 +300,6 @@ def _between(cameras: RecentPoses) -> Array:
     P = cameras.covariance[-12:, -12:]
     cross = A @ P[:6, 6:]
     return np.asarray(P[6:, 6:] + A @ P[:6, :6] @ A.T - cross - cross.T)
-
-
-def _places(frame: int, points: IndexArray, h: Array, shape: Shape) -> Places:
-    """That points at h (M, 3) in a frame's camera belong to a body of a shape there: a Gaussian in the charts at h."""
-    eye = np.eye(4)
-    basis, origin = chart_kernels.relative_charts(eye, h)
-    _, D, _ = chart_kernels.chart_changes(eye, h, basis, np.tile(np.eye(3), (len(h), 1, 1)))
-    back = np.linalg.inv(D)
-    information = np.swapaxes(back, 1, 2) @ np.linalg.inv(shape.covariance) @ back
-    root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
-    middle = origin + (D @ (shape.mean - h)[:, :, None])[:, :, 0]
-    return Places(np.full(len(points), frame), points, basis, middle, np.ascontiguousarray(root))
 
 
 def _velocity(before: Array, after: Array, dt: float) -> tuple[Array, Array]:

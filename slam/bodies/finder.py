@@ -38,7 +38,7 @@ from slam.bodies.config import MIN_FRAMES, MIN_POINTS, RUN, WINDOW
 from slam.bodies.fits import constant_velocity, fit_velocities, measure, times_vectors
 from slam.bodies.frame import Frame, Setup
 from slam.bodies.regions import Region
-from slam.bodies.track_kernels import PART, displaced, fit_fixed_points, inverses
+from slam.bodies.track_kernels import displaced
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among
@@ -104,13 +104,11 @@ def moved_in(body: Body | None, tracks: Tracks, rows: IndexArray, frame: Frame) 
     t, ages, eyes, slide = tracks, frame.ages, frame.poses[:, :3, 3], frame.setup.slide
     rays = t.position[rows] - frame.eye
     if body is None:
-        older = t.older_A, t.older_b, t.older_age
-        return Displacements(rays, *displaced(t.A, t.p, t.dof, *older, rows, ages, _RECENT, rays, eyes, slide))
-    (points, A, known), n = in_body_axes(body, tracks, rows), len(rows)
-    none = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
+        return Displacements(rays, *displaced(t.A, t.p, t.dof, rows, ages, _RECENT, rays, eyes, slide))
+    points, A, known = in_body_axes(body, tracks, rows)
     dof, points = np.where(known, t.dof[rows], 0).astype(np.int8), np.where(known[..., None], points, 0.0)
     inside = (t.position[rows] - body.T[:3, 3]) @ body.T[:3, :3]
-    return Displacements(inside, *displaced(A, points, dof, *none, np.arange(n), ages, _RECENT, rays, eyes, 0.0))
+    return Displacements(inside, *displaced(A, points, dof, np.arange(len(rows)), ages, _RECENT, rays, eyes, 0.0))
 
 
 def known_well(tracks: Tracks, rows: IndexArray, T_world_left: Array) -> tuple[IndexArray, Array]:
@@ -308,24 +306,21 @@ def parting(
     The camera was at `eyes` (W, 3) in the window's frames. In a run's first frames single ones part, too, and however
     many: what moves from the beginning on would else pull the camera along, and the world's axes with it.
     """
-    t, free = tracks, tracks.body[at] < 0
+    t, free, slot = tracks, tracks.body[at] < 0, now % WINDOW
     at, rows = at[free], rows[free]
-    position, P = np.empty_like(t.position), np.empty_like(t.covariance)
-    fit_fixed_points(t.A, t.p, t.anchor, at, position, P)
+    position, A, p, dof = t.position[at], t.A[at], t.p[at], t.dof[at]
     z = measurement_rows(features.uv_left[rows], features.uv_right[rows])
-    points, A, dof = measure(setup.rig, T_world_left, position[at], z, setup.sigma)
-    local = transform(inverse(T_world_left), position[at])
-    well = (
-        (dof > 0) & (t.count(at) >= MIN_FRAMES) & (local[:, 2] > FARTHEST * np.sqrt(np.trace(P[at], axis1=1, axis2=2)))
-    )
-    k = np.flatnonzero(well if now >= WINDOW else dof > 0)
-    share = (t.dof[at[k]] > 0) / np.maximum(t.count(at[k]), 1)[:, None]
-    age, rays = share @ (1 + (now - 1 - np.arange(WINDOW)) % WINDOW), position[at[k]] - T_world_left[:3, 3]
-    far = np.linalg.norm(rays, axis=1)
-    slide = setup.slide * np.linalg.norm(np.cross(rays, T_world_left[:3, 3] - share @ eyes), axis=1)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None] / far[:, None, None] ** 2
-    noise = _PRECISE**2 * (inverses(A[k], PART, 0.0) + P[at[k]]) + slide[:, None, None] * across
-    moved = Displacements(rays, (points - position[at])[k], inverses(noise, PART, 0.0), age)
+    points, A[:, slot], dof[:, slot] = measure(setup.rig, T_world_left, position, z, setup.sigma)
+    p[:, slot] = points - t.anchor[at]
+    local = transform(inverse(T_world_left), position)
+    known = local[:, 2] > FARTHEST * np.sqrt(np.trace(t.covariance[at], axis1=1, axis2=2))
+    well = known & (dof[:, slot] > 0) & (t.count(at) >= MIN_FRAMES)
+    k = np.flatnonzero(well if now >= WINDOW else dof[:, slot] > 0)
+    eyes, ages = eyes.copy(), (slot - np.arange(WINDOW)) % WINDOW
+    eyes[slot] = T_world_left[:3, 3]
+    rays = position[k] - eyes[slot]
+    precise = A[k] / _PRECISE**2, p[k], dof[k], np.arange(len(k))
+    moved = Displacements(rays, *displaced(*precise, ages, 1, rays, eyes, setup.slide))
     view = places_in_view(local)
     scene = classify_scene(moved, view[k], setup.config.suspect)
     if now < WINDOW:

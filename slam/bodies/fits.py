@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.bodies.bodies import Body
-from slam.bodies.track_kernels import constant_velocities, fit_fixed_points, leave_window, points_on_rays
+from slam.bodies.track_kernels import constant_velocities, fit_fixed_points, points_on_rays
 from slam.data import IndexArray, StereoFeatures
 from slam.geometry.rig import StereoRig, measurement_rows
 from slam.geometry.se3 import Array
 from slam.tracks.table import Tracks
 
-_MEMORY = 0.98  # share of what has left the window that is remembered from frame to frame
 _TOO_FAR = 3.0  # expected points so far off that linearising there is worse than at the measured point [px]
 _STEPS = 4  # numerics: of Gauss-Newton at most
 MOVES = 12.0  #: derived: χ²(3) at 99.3 % of the velocity, from which it counts
@@ -34,9 +33,9 @@ def measure(rig: StereoRig, T_world_left: Array, points: Array, measured: Array,
 
 
 def make_room(tracks: Tracks, slot: int) -> None:
-    """Let what `slot` held leave the window for the fading sums, in place."""
-    t = tracks
-    leave_window(t.number, t.A, t.p, t.dof, t.older_A, t.older_b, t.older_age, slot, _MEMORY)
+    """Let what `slot` held leave the window, in place."""
+    for column in (tracks.A, tracks.p, tracks.dof):
+        column[:, slot] = 0
 
 
 def record(
@@ -105,7 +104,6 @@ def revise_tracks(
     alive = np.flatnonzero(tracks.number >= 0)
     shift = _shifts(tracks.position[alive], np.broadcast_to(poses[slot], (len(alive), 4, 4)), rig, correct)
     tracks.position[alive] += shift
-    tracks.older_b[alive] += times_vectors(tracks.older_A[alive], shift)
     for body in bodies.values():
         mine = tracks.body[alive] == body.id
         tracks.local[alive[mine]] += shift[mine] @ body.T[:3, :3]

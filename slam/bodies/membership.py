@@ -2,7 +2,7 @@
 
 A track's measurements are compared with a fixed point in the world and with a fixed point in the body. The difference
 of the two χ² over the window, a log-likelihood ratio, decides. What lies in the extent of an older body and went with
-it is a part of it; a young body that shows more of a thing than the older one takes that one's place.
+it is a part of it.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from functools import cache
 
 import numpy as np
 
-from slam.bodies.bodies import Body, continued, in_body_axes, spread_of_place, with_extent
-from slam.bodies.config import RUN, WINDOW
+from slam.bodies.bodies import CLEAR, Body, in_body_axes, spread_of_place, with_extent
+from slam.bodies.config import MIN_FRAMES, RUN, WINDOW
 from slam.bodies.fits import EXPLAINED, fit_positions, times_vectors
 from slam.bodies.frame import Frame
 from slam.bodies.track_kernels import LEAST, RIDGE, inverses, squares, weighted_means
@@ -28,15 +28,9 @@ _MOST_POINTS = 80  # cost: members of a body
 _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]
 _MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of both diagonals
-_NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join, and
-_INSIDE = 4.0  # up to which it counts as inside, the extent being widened by
-_EDGE = 0.1  # as a share of its diagonal: the outermost points lie beyond the percentiles
-_LOOSE = 4.0  # by how much it may exceed the 99 % limit then
-_BETTER = 6.0  # by how much χ² the body must explain a track better than the still world does, for it to join, and
-_BETTER_INSIDE = -4.0  # where it lies inside
-CLEAR = 9.0  #: a track for which the still world is better by more is no member, or leaves
+_NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join
+_LOOSE = 4.0  # times the 99 % limit that the χ² of a member may be whose motion is explained for the most part
 _MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
-_ENOUGH = 6  # frames after which a member must fit, and after which one that did not may join again
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
 _DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
 
@@ -136,12 +130,13 @@ def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: IndexArra
 
     And how many of them stand still inside it.
     """
-    inside = _distances(body, tracks, rows, _EDGE) < _INSIDE
+    away = _distances(body, tracks, rows, 0.0)
+    inside = away < _NEAR
     proof = tracks.expelled[rows] | (not resolved)
     gain, fits, count = membership_test(body, tracks, rows)
-    better = gain > np.where(inside & ~proof, _BETTER_INSIDE, _BETTER)
-    joins = better & fits & (count >= np.where(proof, _ENOUGH, 2)) & ~tracks.still[rows]
-    against = (_distances(body, tracks, rows, 0.0) == 0.0) & (gain < -CLEAR)
+    better = gain > np.where(inside & ~proof, -body.solid, CLEAR)
+    joins = better & fits & (count >= np.where(proof, MIN_FRAMES, 2)) & ~tracks.still[rows]
+    against = (away == 0.0) & (gain < -CLEAR)
     return np.where(joins, gain, -np.inf), int(against.sum())
 
 
@@ -153,10 +148,10 @@ def _expel(body: Body, tracks: Tracks) -> Array:
     mine = np.flatnonzero(tracks.body == body.id)
     (gain, fits, count), seen = membership_test(body, tracks, mine), tracks.found[mine]
     most_fit = fits[seen].sum() > _MOST * seen.sum()
-    unfit = ~fits & (count >= _ENOUGH) & most_fit
+    unfit = ~fits & (count >= MIN_FRAMES) & most_fit
     stays = tracks.still[mine] & (body.moving | ~tracks.sure[mine])
     wrong = stays | (tracks.misfit[mine] >= RUN) | (seen & ((gain < -CLEAR) | unfit))
-    tracks.sure[mine] |= fits & (gain > _BETTER)
+    tracks.sure[mine] |= fits & (gain > CLEAR)
     if wrong.any():
         remove_members(tracks, mine[wrong & ~seen], body)
         tracks.expelled[mine[wrong]] = True
@@ -183,9 +178,9 @@ def tracks_on_bodies(bodies: Mapping[int, Body], tracks: Tracks) -> tuple[IndexA
             continue
         close = free[_distances(body, tracks, free, MARGIN) < _NEAR]
         near[close] = True
-        inside = close[_distances(body, tracks, close, _EDGE) < _INSIDE]
+        inside = close[_distances(body, tracks, close, 0.0) < _NEAR]
         if len(inside) and body.proven:
-            asked = np.where(tracks.expelled[inside], _BETTER, _BETTER_INSIDE)
+            asked = np.where(tracks.expelled[inside], CLEAR, -body.solid)
             on[inside[membership_test(body, tracks, inside)[0] > asked]] = True
     return np.flatnonzero(on), np.flatnonzero(near & ~on)
 
@@ -291,13 +286,8 @@ def merge(bodies: dict[int, Body], tracks: Tracks) -> None:
         body = bodies[id] = replace(body, alike=0 if whole is None else body.alike + 1)
         if whole is None or not (body.alike > 2 * WINDOW or (body.seen < 2 * WINDOW and whole.id != body.apart_from)):
             continue
-        theirs = _members(tracks, whole.id)
-        if len(theirs) >= len(mine):
-            add_members(whole, tracks, mine, sure=True)
-            tracks.give_up(np.flatnonzero(tracks.body == id))
-        else:
-            bodies[whole.id] = _in_place_of(whole, body, theirs, tracks)
-            tracks.body[tracks.body == id] = whole.id
+        add_members(whole, tracks, mine, sure=True)
+        tracks.give_up(np.flatnonzero(tracks.body == id))
         del bodies[id]
 
 
@@ -317,18 +307,6 @@ def _apart(body: Body, mine: IndexArray, other: Body, theirs: IndexArray, tracks
         return 1.0
     apart = distinctness(body, mine, other, theirs, tracks)
     return apart if explained else max(apart, 1.0)
-
-
-def _in_place_of(known: Body, body: Body, mine: IndexArray, tracks: Tracks) -> Body:
-    """A body under the id of a known one that is a part of it; its seen members `mine` go over."""
-    tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.found))
-    grown = continued(body, known)
-    own, change = tracks.body == body.id, inverse(grown.T) @ body.T
-    R = change[:3, :3]
-    tracks.local[own] = transform(change, tracks.local[own])
-    tracks.local_information[own] = R @ tracks.local_information[own] @ R.T
-    add_members(grown, tracks, mine, sure=True)
-    return grown
 
 
 def _members(tracks: Tracks, id: int) -> IndexArray:

@@ -31,9 +31,8 @@ from slam.bodies.scene_kernels import MEDIAN, PRIOR
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, inverse, points_by_pose
 
-PROVEN = 12.0  #: −log10 of the chance from which a body has moved for certain if it went farther than the camera; at 8
-#: the same bodies are found in `boxes` and on drives, and twice as many pieces of a walker
-_SLIDES = 20.0  # the same elsewhere: what slides with the camera was seen to agree by up to some 1e-19
+PROVEN = 12.0  #: −log10 of the chance from which a frame proves that a body moves that went farther than the camera
+_SLIDES = 20.0  # the same elsewhere: what slides with the camera was seen to agree by up to 1e-16
 _FARTHER = 2.0  # times the camera's way; from 2 to 4 nothing changes, at 1 what slides in EuRoC MH_01 is a body
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
 _MOST = 40.0  # numerics: of the evidence of a frame
@@ -69,10 +68,10 @@ class Way:
         return cls(places, stamps[seen], by_rig, cameras[seen, :3, 3])
 
     @property
-    def far(self) -> bool:
-        """Whether it is longer than that of the camera by far: what slides does not go so far."""
+    def bar(self) -> float:
+        """−log10 of the chance from which it is certain: what slides does not go farther than the camera by far."""
         went = np.linalg.norm(np.ptp(self.places, axis=0), axis=1).max()
-        return bool(went > _FARTHER * np.linalg.norm(np.ptp(self.cameras, axis=0)))
+        return PROVEN if went > _FARTHER * np.linalg.norm(np.ptp(self.cameras, axis=0)) else _SLIDES
 
     def beside_camera(self) -> Array:
         """The places (K, 4, 3) less the share of the camera's way, 0 to 1, that is most like the way of their middle.
@@ -90,17 +89,14 @@ def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, fa
     The evidence is a cumulative sum of −log10 of the chance that the weaker test gives; it fades while a body rests.
     For a body that was followed `far`, for farther than it is wide, its way alone counts.
     """
-    places = way.places if far else way.beside_camera()
-    says, turns, enough = _by_frames(places, way.times), 0.0, len(moved.d) >= MIN_POINTS
-    if enough and not far:
+    says, turns, bar = _by_frames(way.places if far else way.beside_camera(), way.times), 0.0, way.bar
+    if len(moved.d) < MIN_POINTS:
+        return evidence, 2 * (far and says >= bar)
+    if not far:
         by_members, turns = _by_members(moved, scene, way.by_rig)
         says = min(says, by_members)
-    if enough:
-        evidence = max(0.0, evidence + says - _ALLOWANCE)
-    bar = PROVEN if way.far else _SLIDES
-    if not (enough or far) or says < max(0.5 * PROVEN, bar - turns):
-        return evidence, 0
-    return evidence, 2 if says >= PROVEN else 1
+    counts = 0 if says < max(0.5 * PROVEN, bar - turns) else 2 if says >= PROVEN else 1
+    return max(0.0, evidence + says - _ALLOWANCE), counts
 
 
 def _evidence(chance: float) -> float:

@@ -3,8 +3,8 @@
 A body that shows few tracks at a time, and each for a few frames only (a cyclist, a distant car), never has as many
 long tracks as `slam.bodies.finder` needs. Here the region is followed instead of its tracks: tracks come and go, the
 region's place and velocity stay in a Kalman filter with constant velocity. A region that is followed over more than its
-own size, supported all the way by tracks that move as it does, and contradicted by few inside it, cannot be still:
-where velocities are wrong (false matches, depth noise) the region walks away from the tracks that made it.
+own size by tracks that move as it does is hardly still: where velocities are wrong (false matches, depth noise) the
+region walks away from the tracks that made it.
 """
 
 from __future__ import annotations
@@ -14,16 +14,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.bodies.config import MIN_FRAMES, RUN
-from slam.bodies.fits import AGREES, EXPLAINED, MOVES, ConstantVelocity, constant_velocity
+from slam.bodies.fits import AGREES, MOVES, ConstantVelocity, constant_velocity
 from slam.bodies.frame import Frame
 from slam.data import BoolArray, IndexArray
 from slam.geometry.kernels import squared_distances
 from slam.geometry.rig import MINIMAL_POINTS
-from slam.geometry.se3 import Array, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array
 from slam.tracks.table import Tracks
 
 _NEAR = 7.8  # derived: χ²(3) at 95 %, of tracks inside the region
-_SHARE = 0.6  # of the tracks inside that must agree with it
 _OVERLAP = 3.0  # velocities of successive frames come from the same window: their covariance is larger by so much
 
 
@@ -36,11 +35,8 @@ class Region:
     state: Array  # place and velocity (6,) in world axes [m], [m/s]
     covariance: Array  # of the state (6, 6)
     start: Array  # place where it began (3,)
-    start_covariance: Array  # its covariance (3, 3)
     way: Array  # how far its velocity has taken it since it began (3,) [m]
     frames: int = 0  # number of frames with as many as fix a motion
-    agreeing: int = 0  # number of tracks inside it so far that moved with it
-    contradicting: int = 0  # and that did not
     unseen: int = 0  # number of frames without a track
 
     def advanced(self, frame: Frame) -> Region:
@@ -52,24 +48,14 @@ class Region:
         return replace(self, state=F @ self.state, covariance=P, way=self.way + frame.dt * self.state[3:])
 
     def has_moved(self, frame: Frame) -> bool:
-        """Whether it has moved far enough, and for certain.
-
-        Its velocity must have taken it that far: a region can also get there by taking up other still tracks. All that
-        is seen shares the error of the camera's pose, so that does not fall with the number of tracks.
-        """
-        moved = self.state[:3] - self.start
-        length = float(np.linalg.norm(moved))
-        if (
-            min(len(self.rows) - MINIMAL_POINTS, self.frames - MIN_FRAMES) < 0
-            or self.agreeing <= _SHARE * (self.agreeing + self.contradicting)
-            or min(length, float(np.linalg.norm(self.way))) <= 2.0 * self.radius
-            or np.linalg.norm(self.state[3:]) <= frame.setup.config.min_speed
-        ):
-            return False
-        J = frame.T_world_left[:3, :3] @ points_by_pose(transform(inverse(frame.T_world_left), self.state[None, :3]))[0]
-        camera = J @ frame.cameras.covariance[-6:, -6:] @ J.T
-        covariance = self.covariance[:3, :3] + self.start_covariance + 2.0 * camera
-        return bool(length**2 > 3.0 * np.sqrt(moved @ covariance @ moved))
+        """Whether it has gone farther than it is wide, by its velocity: taking up other still tracks takes it, too."""
+        ways = self.state[:3] - self.start, self.way
+        return bool(
+            len(self.rows) >= MINIMAL_POINTS
+            and self.frames >= MIN_FRAMES
+            and min(np.linalg.norm(way) for way in ways) > 2.0 * self.radius
+            and np.linalg.norm(self.state[3:]) > frame.setup.config.min_speed
+        )
 
     def corrected(self, m: ConstantVelocity, spread: Array, rows: IndexArray) -> Region:
         """The region with what tracks (K,) say; points in it lie about its place with a `spread` (N, 3, 3)."""
@@ -89,7 +75,7 @@ class Region:
 def follow_regions(regions: list[Region], frame: Frame, tracks: Tracks) -> tuple[list[Region], list[Region]]:
     """Regions in this frame, the longest known first, then those of tracks that move and support none.
 
-    As those that go on, and those that have moved for certain. Free tracks count whose depth is known better than to
+    As those that go on, and those that have moved. Free tracks count whose depth is known better than to
     within a region.
     """
     s, c = frame.setup, frame.setup.config
@@ -116,14 +102,9 @@ def follow_regions(regions: list[Region], frame: Frame, tracks: Tracks) -> tuple
         free &= ~mine
         if mine.any():
             r = r.corrected(m, spread, np.flatnonzero(mine))
-            left, inside = off(r)
-            own = rows[mine & inside]  # where its place was hardly known, from everywhere
-            against = inside & (left > AGREES) & (left > EXPLAINED * m.test)
-            r = replace(
-                r, rows=own, frames=r.frames + (len(own) >= MINIMAL_POINTS), unseen=0,
-                radius=float(radius[mine].mean()), agreeing=r.agreeing + int((inside & (left <= AGREES) & moves).sum()),
-                contradicting=r.contradicting + int(against.sum()),
-            )  # fmt: skip
+            own = rows[mine & off(r)[1]]  # where its place was hardly known, from everywhere
+            frames, size = r.frames + (len(own) >= MINIMAL_POINTS), float(radius[mine].mean())
+            r = replace(r, rows=own, frames=frames, unseen=0, radius=size)
         else:
             r = replace(r, rows=rows[:0], unseen=r.unseen + 1)
         if r.unseen <= RUN:
@@ -148,15 +129,8 @@ def _new_regions(
         group = free[alike[i] & left]
         if left[i] and len(group) >= 2:
             left &= ~alike[i]
-            none, unknown = np.zeros(6), 1e12 * np.eye(6)
-            r = Region(float(radius[group].mean()), rows[group], none, unknown, none[:3], unknown, none[:3])
+            none, frames = np.zeros(6), int(len(group) >= MINIMAL_POINTS)
+            r = Region(float(radius[group].mean()), rows[group], none, 1e12 * np.eye(6), none[:3], none[:3], frames)
             r = r.corrected(m, spread, group)
-            regions.append(
-                replace(
-                    r,
-                    start=r.state[:3],
-                    start_covariance=r.covariance[:3, :3],
-                    frames=int(len(group) >= MINIMAL_POINTS),
-                )
-            )
+            regions.append(replace(r, start=r.state[:3]))
     return regions

@@ -45,21 +45,6 @@ def inverses(M, share, least):
 
 
 @kernel
-def leave_window(ids, A, p, dof, older_A, older_b, older_age, slot, memory):
-    """Move what `slot` holds from the windows of all tracks to their fading sums, in place."""
-    for n in range(len(ids)):
-        if ids[n] < 0:
-            continue
-        leaving = A[n, slot]
-        older_age[n] = memory * (older_age[n] + trace(older_A[n])) + A.shape[1] * trace(leaving)
-        for i in range(3):
-            older_b[n, i] = memory * older_b[n, i] + row_times(leaving, i, p[n, slot])
-            for j in range(3):
-                older_A[n, i, j] = memory * older_A[n, i, j] + leaving[i, j]
-        leaving[:], p[n, slot], dof[n, slot] = 0.0, 0.0, 0
-
-
-@kernel
 def fit_fixed_points(A, p, anchor, rows, position, covariance):
     """Fixed points that fit the windows best, and their covariances, into `position` (N, 3), `covariance` (N, 3, 3)."""
     total, told = np.empty((3, 3)), np.empty(3)
@@ -115,7 +100,7 @@ def constant_velocities(A, p, rows, times, prior):
 
 
 @kernel
-def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent, rays, centres, slide):
+def displaced(A, p, dof, rows, ages, most_recent, rays, centres, slide):
     """How far tracks went from the older to the recent frames of their windows: see `slam.bodies.finder`.
 
     Slots have `ages` (W,) in frames, of which `most_recent` are recent at most; `rays` (M, 3) point from the camera,
@@ -131,11 +116,8 @@ def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent, r
         for w in range(A.shape[1]):
             count += dof[n, w] > 0
         recent = min(max(count // 2, 2), most_recent)
-        now[:], b_now[:], before[:] = 0.0, 0.0, 0.0
-        _add(before, older_A[n], 1.0)
-        for i in range(3):
-            b_before[i] = older_b[n, i]
-        late, early = 0.0, older_age[n]
+        now[:], b_now[:], before[:], b_before[:] = 0.0, 0.0, 0.0, 0.0
+        late = early = 0.0
         late_slot, early_slot = -1, -1
         for w in range(A.shape[1]):
             if dof[n, w] == 0:

@@ -145,9 +145,6 @@ class Tracks(LandmarkTable):
     A: Array = _column(float, 0, 3, 3)  # information (N, W, 3, 3), zero without measurement; slot ``frame % W``
     p: Array = _column(float, 0, 3)  # the point that the pixels say (N, W, 3), relative to the anchor
     dof: NDArray[np.int8] = _column(np.int8, 0)  # numbers measured (N, W): 3, 2 or 0
-    older_A: Array = _column(float, 3, 3)  # fading sum of A of what has left the window (N, 3, 3)
-    older_b: Array = _column(float, 3)  # fading sum of its ``A p`` (N, 3)
-    older_age: Array = _column(float)  # fading sum of its ages in frames, each times the trace of its A (N,)
     position: Array = _column(float, 3)  # where it is now, in world coordinates (N, 3)
     covariance: Array = _column(float, 3, 3)  # of the position (N, 3, 3)
     velocity: Array = _column(float, 3)  # (N, 3) [m/s], zero for those that a fixed point explains
@@ -293,5 +290,5 @@ class Tracks(LandmarkTable):
     def forget_past(self, rows: IndexArray) -> None:
         """Make tracks free and without measurements, in place."""
         self.body[rows], self.misfit[rows], self.streak[rows], self.doubtful[rows] = -1, 0, 0, False
-        for array in (self.A, self.p, self.dof, self.older_A, self.older_b, self.older_age, self.velocity):
+        for array in (self.A, self.p, self.dof, self.velocity):
             array[rows] = 0

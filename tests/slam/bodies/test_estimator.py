@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,14 +11,15 @@ import pytest
 from scipy.optimize import least_squares
 
 import backends
+from slam.bodies.belief import slid
 from slam.bodies.estimator import FRAMES, BodyEstimator
 from slam.bodies.frame import recent_poses, with_estimate
 from slam.data import Observations, RecentPoses
-from slam.errors import ConfigurationError
 from slam.evaluation.metrics import chi_square_band
 from slam.geometry import se3
 from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate
+from slam.window.problem import Motion
 from slam.window.stereo import RectifiedStereo
 from tests.slam.bodies.body_scene import SIGMA, box_scene, car_scene, follow, score
 
@@ -50,29 +52,28 @@ def test_every_back_end_serves(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [box_scene, car_scene])
-def test_nees(make):
+@pytest.mark.parametrize("scene_of", [box_scene, car_scene, partial(car_scene, distance=30.0, points=15)])
+def test_nees(scene_of):
     """Mean NEES of pose and velocity inside the 95 % band of a single frame, three frames that are nearly independent.
 
-    The car's depth is known to 4 % only, and linearisation costs something: a fifth more at the top there.
+    The car's depth is known to 4 or 8 % only, and linearisation costs something: a third more at the top there.
     """
     pose, velocity = [], []
     for seed in range(SEEDS):
-        scene = make(seed=seed, frames=10)
-        still = replace(scene.models.objects, drift=0.0)  # the simulated features do not drift
-        found = outcome(replace(scene, models=replace(scene.models, objects=still)), seed=seed)
+        found = outcome(scene_of(seed=seed, frames=10), seed=seed)
         pose.append(found.pose_nees[[2, 4, 8]])
         velocity.append(found.velocity_nees[[2, 4, 8]])
     low, high = chi_square_band(6, SEEDS)
+    most = high if scene_of is box_scene else 1.33 * high
     # Velocities are constant in these scenes, where the motion model allows for impulses: rather too uncertain.
-    assert low < np.mean(pose) < (1.2 if make is car_scene else 1.0) * high
-    assert 0.9 * low < np.mean(velocity) < (1.2 if make is car_scene else 1.0) * high
+    assert low < np.mean(pose) < most
+    assert 0.9 * low < np.mean(velocity) < most
 
 
 def test_agrees_with_a_dense_solution_of_all_frames():
     """Poses and points of all frames at once, by scipy, with a known camera: what is marginalised loses nothing."""
     scene = box_scene(seed=3, frames=7, moving=False, points=8)
-    stereo, models = RectifiedStereo.of(scene.rig), replace(scene.models.objects, drift=0.0)
+    stereo, models = RectifiedStereo.of(scene.rig), replace(scene.models.objects)
     rng, estimator = np.random.default_rng(5), BodyEstimator(scene.rig, replace(scene.models, objects=models))
     first = se3.pose(np.eye(3), scene.points.mean(axis=0))
     belief, z = None, []
@@ -225,6 +226,19 @@ def test_a_body_that_is_elsewhere_begins_anew_where_it_is_said_to_be():
     assert beliefs[-1].estimate.T_world_object[:3, 3] == pytest.approx(start[:3, 3] + [0.2, 0, 0], abs=0.02)
 
 
+def test_a_point_that_was_given_up_leaves_with_all_its_measurements():
+    """They are in what is known of the others from then on: kept as well, they would count twice."""
+    scene_ = box_scene(0, FRAMES + 3)
+    *_, (_, b, _) = follow("ekf", scene_)
+    member = next(p for p in b.prior.points.tolist() if (b.rows.point == p).any() and b.points.ids[p] >= 0)
+    ids = b.points.ids.copy()
+    ids[member] = -1
+    given_up = replace(b, points=replace(b.points, ids=ids))
+    after = slid(given_up, RectifiedStereo.of(scene_.rig), Motion.none())
+    assert b.points.ids[member] not in after.points.ids
+    assert len(after.points) == len(slid(b, RectifiedStereo.of(scene_.rig), Motion.none()).points) - 1
+
+
 def test_too_few_points_begin_no_body():
     scene, rng = box_scene(frames=1), np.random.default_rng(0)
     seen = scene.observations(0, rng)
@@ -263,12 +277,6 @@ def test_derived_recent_poses():
 # --- models ---
 
 
-@pytest.mark.parametrize("option", [{"acceleration": 0.0}, {"angular_acceleration": float("nan")}, {"points": 2}])
-def test_models_are_checked(option):
-    with pytest.raises(ConfigurationError):
-        ObjectModels(**option)
-
-
 def test_what_a_body_can_do():
     models, known = ObjectModels(max_speed=2.0, max_acceleration=10.0, max_turn_rate=3.0), 1e-6 * np.eye(6)
     still, fast, turning = np.zeros(6), np.array([0, 0, 0, 1.5, 0, 0]), np.array([0, 3.1, 0, 0, 0, 0])
@@ -286,11 +294,3 @@ def test_what_a_body_can_do():
     assert models.known(estimate(known, known))
     assert not models.known(estimate(np.diag([1, 1, 1, 4, 4, 4.0]), known))
     assert not models.known(estimate(known, np.full((6, 6), np.nan)))
-
-
-@pytest.mark.parametrize("still", [False, True])
-def test_a_body_has_moved_if_its_motion_is_more_than_all_that_is_uncertain(still):
-    """A box at rest before a moving camera never has; one that moves has within a few frames."""
-    for seed in range(5):
-        beliefs = [b for _, b, _ in follow("window", box_scene(seed=seed, frames=15, still=still), seed)]
-        assert any(b.moved for b in beliefs) != still

@@ -9,7 +9,6 @@ import pytest
 
 from slam.bodies.following import follow
 from slam.geometry.se3 import transform
-from slam.tracks.table import Tracks
 from tests.slam.bodies.test_recovery import POINTS, begin, frame_of, scene
 
 
@@ -46,9 +45,3 @@ def test_landmarks_that_were_found_keep_their_features_wherever_they_were_expect
     tracks.set_features(np.array([free[0], free[1], members[2]]), np.array([1, 0, 3]))
     follow(tracks, {1: replace(body, missed=2)}, frame_of(features, 25.0))
     assert tracks.row[[free[0], free[1], members[2]]].tolist() == [1, 0, 3]
-
-
-def test_of_landmarks_that_were_found_as_one_feature_one_has_it():
-    tracks = Tracks.empty(4)
-    tracks.set_features(np.array([3, 5, 8]), np.array([1, 0, 1]))
-    assert np.flatnonzero(tracks.row >= 0).tolist() == [3, 5] and tracks.row[3] == 1

@@ -35,9 +35,8 @@ def test_a_displacement_is_less_certain_by_the_slide_of_a_feature_seen_from_else
     """The camera goes by 0.2 m across a line of sight of 2 m: 0.1 rad, so much variance of the direction, at 2 m."""
     A, p, dof = np.tile(1e6 * np.eye(3), (1, SLOTS, 1, 1)), np.zeros((1, SLOTS, 3)), np.full((1, SLOTS), 3, np.int8)
     ages, ray = np.arange(SLOTS)[::-1].copy(), np.array([[0.0, 0.0, 2.0]])
-    none = np.zeros((1, 3, 3)), np.zeros((1, 3)), np.zeros(1)
     centres, P = 0.04 * np.arange(SLOTS)[:, None] * np.array([1.0, 0, 0]), {}
     for slide in (0.0, 1e-4):
-        _, W, _ = track_kernels.displaced(A, p, dof, *none, np.array([0]), ages, 3, ray, centres, slide)
+        _, W, _ = track_kernels.displaced(A, p, dof, np.array([0]), ages, 3, ray, centres, slide)
         P[slide] = np.linalg.inv(W[0])
     np.testing.assert_allclose(P[1e-4] - P[0.0], 1e-4 * 0.1 * 2.0**2 * np.diag([1.0, 1.0, 0.0]), atol=1e-12)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from slam.bodies import membership
-from slam.bodies.bodies import PROOF, Body, continued, new_body, with_evidence, with_extent
+from slam.bodies.bodies import CLEAR, PROOF, Body, continued, new_body, with_evidence, with_extent
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.fits import fit_positions
 from slam.bodies.membership import merge
 from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, exp, inverse, transform
+from slam.geometry.se3 import Array, exp, transform
 from slam.tracks.table import Tracks
 
 WINDOW = 12
@@ -114,7 +114,7 @@ def test_what_encloses_points_that_stand_still_is_no_body(inside: int, solid: bo
     body = body_along(poses, np.arange(16), tracks)
     gains, against = membership.update_members({1: body}, FRAME, tracks)[1]
     assert against == inside
-    assert with_evidence(body, 0.0, int((gains > membership.CLEAR).sum()), against).proven == solid
+    assert with_evidence(body, 0.0, int((gains > CLEAR).sum()), against).proven == solid
 
 
 @pytest.mark.parametrize(
@@ -131,26 +131,6 @@ def test_bodies_are_one_only_where_they_move_as_one(velocity: Array, off: float,
     bodies[2] = replace(body_along(path(velocity), np.arange(10, 16), tracks, id=2), seen=seen)
     merge(bodies, tracks)
     assert list(bodies) == ([1] if one or seen == 5 else [1, 2])
-
-
-def test_an_older_body_gives_its_place_to_a_young_one_that_shows_more_of_it() -> None:
-    local, off = corners(12, 12), MOVING + np.array([4.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    tracks = table(seen_from(path(MOVING), local, 13))
-    few, more = (
-        body_along(path(off), np.arange(3), tracks, id=1),
-        body_along(path(MOVING), np.arange(3, 12), tracks, id=2),
-    )
-    few = replace(few, alike=1, T=few.T @ exp(np.array([0, 0, 0, 0.1, 0, 0])))
-    more = replace(more, seen=5)
-    bodies = {1: few, 2: more}
-    merge(bodies, tracks)
-    assert list(bodies) == [1]
-    assert (tracks.body == np.where(tracks.number >= 0, 1, -1)).all()
-    grown = bodies[1]
-    np.testing.assert_allclose(grown.T[:3, :3], few.T[:3, :3])  # the older one's axes, at its own place
-    np.testing.assert_allclose(grown.history @ inverse(grown.T), more.history @ inverse(more.T), atol=1e-12)
-    assert grown.belief is None  # its estimate begins anew
-    np.testing.assert_allclose(transform(grown.T, tracks.local[:12]), transform(more.T, local), atol=0.01)
 
 
 def test_a_body_seen_again_is_known_by_its_place_and_velocity() -> None:

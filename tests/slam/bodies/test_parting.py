@@ -131,36 +131,3 @@ def test_a_box_that_starts_to_move_does_not_carry_the_camera_along(start, backen
         error = log(inverse(first @ sequence.ground_truth.poses[k]) @ estimate.T_world_left)[3:]
         errors.append(np.sqrt(error @ np.linalg.solve(estimate.covariance[3:, 3:], error)))
     assert np.max(errors[20:]) < 4.5 and np.median(errors[20:]) < 2.0
-
-
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
-def test_boxes_that_move_from_the_first_frame_on_draw_the_camera_less(backend):
-    """Errors of the camera after 15 frames: without this test of landmarks they are twice as large."""
-    errors = {tested: [error_after(15, seed, backend, tested) for seed in range(3)] for tested in (True, False)}
-    assert np.mean(errors[True]) < 0.75 * np.mean(errors[False])
-
-
-def error_after(frames, seed, backend, tested):
-    """Distance of the camera from where it is [m] after so many frames before moving boxes."""
-    sequence = slam.open_sequence(f"synthetic:boxes?density=300&sigma=0.2&seed={seed}&layout={seed}")
-    system = slam.StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind, None))
-    if not tested:
-        system.objects.parting = lambda *_: np.zeros(0, np.int64)
-    poses = [system.process_features(sequence.simulate(k).features).estimate.T_world_left for k in range(frames + 1)]
-    world = poses[0] @ inverse(sequence.ground_truth.poses[0])
-    return float(np.linalg.norm(log(inverse(poses[-1]) @ world @ sequence.ground_truth.poses[frames])[3:]))
-
-
-def test_a_landmark_s_first_sight_is_its_track_s():
-    """No later than it joined the map, but for the few that were given up and begun again since."""
-    sequence = slam.open_sequence("synthetic:aisle?density=40")
-    system = slam.StereoSlam(sequence.rig, None, "ekf", config=SystemConfig.for_kind(sequence.kind, None))
-    joined = {}
-    for k in range(8):
-        result = system.process_features(sequence.simulate(k).features)
-        joined.update(dict.fromkeys(result.added.tolist(), k))
-    tracks = system._state.tracks
-    followed = np.flatnonzero((tracks.ids >= 0) & (tracks.number >= 0))
-    first = (tracks.dof[followed] > 0).argmax(axis=1)
-    assert len(first) > 20 and (first > 0).any()
-    assert (first <= [joined[id] for id in tracks.ids[followed].tolist()]).mean() > 0.8

@@ -12,15 +12,14 @@ from slam.bodies.finder import Displacements, classify_scene, moved_in, tail
 from slam.geometry.se3 import hat, transform
 from tests.slam.bodies.test_membership import SIGMA, SLOT, TIMES, WINDOW, body_along, path, seen_from, table
 
-RNG = np.random.default_rng(3)
 
-
-def scene(count=80, near=12, shift=(0.0, 0.0, 0.0), pose_error=(0.0,) * 6, noise=1e-3):
+def scene(count=80, near=12, shift=(0.0, 0.0, 0.0), pose_error=(0.0,) * 6, noise=1e-3, seed=3):
     """A wall with a group of nearer points before it; the pose error displaces all, the shift the near ones."""
-    points = np.column_stack([RNG.uniform(-1, 1, (count, 2)), RNG.uniform(2.0, 2.4, count)])
-    points[:near] = np.column_stack([RNG.uniform(-0.1, 0.1, (near, 2)), RNG.uniform(0.95, 1.05, near)])
+    rng = np.random.default_rng(seed)
+    points = np.column_stack([rng.uniform(-1, 1, (count, 2)), rng.uniform(2.0, 2.4, count)])
+    points[:near] = np.column_stack([rng.uniform(-0.1, 0.1, (near, 2)), rng.uniform(0.95, 1.05, near)])
     pose_error = np.asarray(pose_error)
-    d = pose_error[3:] - np.einsum("nij,j->ni", hat(points), pose_error[:3]) + noise * RNG.standard_normal((count, 3))
+    d = pose_error[3:] - np.einsum("nij,j->ni", hat(points), pose_error[:3]) + noise * rng.standard_normal((count, 3))
     d[:near] += shift
     W = np.repeat(np.eye(3)[None] / noise**2, count, axis=0)
     view = np.column_stack([points[:, :2] / points[:, 2:], np.log(points[:, 2])])
@@ -35,19 +34,14 @@ def test_a_wrong_pose_moves_nothing():
     assert found.alone.max() < 30  # χ²(3) of 80 points: 99.9999 %
 
 
-def test_the_near_group_is_found_though_the_pose_is_wrong():
-    moved, view = scene(shift=(0.006, 0.0, 0.0), pose_error=np.array([0.0, 0.02, 0.005, 0.02, 0.0, 0.01]))
+@pytest.mark.parametrize("pose_error", [(0.0, 0.02, 0.005, 0.02, 0.0, 0.01), (0.0, 0.0, 0.0, -0.006, 0.0, 0.0)])
+def test_the_near_group_is_found_though_the_pose_is_wrong(pose_error):
+    """Also where the pose follows the group, so that its points stand still and the wall is displaced."""
+    moved, view = scene(shift=(0.006, 0.0, 0.0), pose_error=pose_error)
     found = classify_scene(moved, view, 30.0)
     assert len(found.groups) == 1
     assert set(found.groups[0].members) <= set(range(12)) and len(found.groups[0].members) >= 10
     assert abs(found.groups[0].away - 0.006) < 0.002
-
-
-def test_where_the_near_group_rules_the_pose_it_is_still_the_one_that_moves():
-    """The pose follows the box, so that its own points stand still and the wall is displaced."""
-    moved, view = scene(shift=(0.006, 0.0, 0.0), pose_error=np.array([0.0, 0.0, 0.0, -0.006, 0.0, 0.0]))
-    found = classify_scene(moved, view, 30.0)
-    assert len(found.groups) == 1 and set(found.groups[0].members) <= set(range(12))
 
 
 def test_too_few_tracks_say_nothing():
@@ -65,40 +59,29 @@ def test_single_false_tracks_find_no_company():
     assert set(np.flatnonzero(found.alone > 100)) == {20, 40, 60}
 
 
-def test_two_groups_that_move_differently_are_two():
-    moved, view = scene(count=120, near=12, shift=(0.006, 0.0, 0.0))
-    second = np.arange(12, 24)
-    moved.points[second] = np.column_stack([RNG.uniform(0.4, 0.5, (12, 2)), RNG.uniform(0.95, 1.05, 12)])
-    view[second] = np.column_stack(
-        [moved.points[second, :2] / moved.points[second, 2:], np.log(moved.points[second, 2])]
-    )
-    moved.d[second] += (0.0, -0.008, 0.0)
-    found = classify_scene(moved, view, 30.0)
-    assert len(found.groups) == 2
-    assert {frozenset(g.members <= 11) for g in found.groups} == {frozenset({True}), frozenset({False})}
-
-
-def test_where_errors_have_heavy_tails_a_small_group_that_agrees_by_chance_does_not_move():
+@pytest.mark.parametrize("seed", range(5))
+def test_where_errors_have_heavy_tails_a_small_group_that_agrees_by_chance_does_not_move(seed):
     """Displacements of a third of the scene are four times as uncertain as modelled: so may be those of the group."""
-    found = {}
+    found, rng = {}, np.random.default_rng(seed)
     for spoilt in (False, True):
-        moved, view = scene(shift=(0.0022, 0.0, 0.0))
+        moved, view = scene(shift=(0.0025, 0.0, 0.0), seed=seed)
         if spoilt:
-            third = RNG.permutation(np.arange(12, 80))[:27]
-            moved.d[third] += 4e-3 * RNG.standard_normal((27, 3))
+            third = rng.permutation(np.arange(12, 80))[:27]
+            moved.d[third] += 4e-3 * rng.standard_normal((27, 3))
         found[spoilt] = classify_scene(moved, view, 20.0)
     assert len(found[False].groups) == 1
     assert not found[True].groups
-    assert tail(found[True].alone) > 1.5 > tail(found[False].alone)
+    assert tail(found[True].alone) > 1.4 > tail(found[False].alone)
 
 
 def test_three_bodies_with_a_third_of_the_tracks_do_not_hide_each_other():
     """The tail of errors is that of the tracks in no group: bodies together may have more than a quarter of all."""
     moved, view = scene(count=200, near=24, shift=(0.006, 0.0, 0.0))
+    rng = np.random.default_rng(4)
     for start, x, shift in ((24, 0.45, (0.0, -0.008, 0.0)), (48, -0.45, (0.0, 0.007, 0.003))):
         rows = slice(start, start + 24)
         moved.points[rows] = np.column_stack(
-            [RNG.uniform(x - 0.05, x + 0.05, 24), RNG.uniform(-0.1, 0.1, 24), RNG.uniform(0.95, 1.05, 24)]
+            [rng.uniform(x - 0.05, x + 0.05, 24), rng.uniform(-0.1, 0.1, 24), rng.uniform(0.95, 1.05, 24)]
         )
         view[rows] = np.column_stack([moved.points[rows, :2] / moved.points[rows, 2:], np.log(moved.points[rows, 2])])
         moved.d[rows] += shift
