@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -25,6 +26,8 @@ from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
 from slam.third_party import checked, named_failures
 from slam.tracks.step import HIDDEN
+
+logger = logging.getLogger("slam.run")
 
 
 @dataclass(eq=False)
@@ -119,6 +122,10 @@ def results_of(
 ) -> dict[str, Any]:
     """The part of a summary that says how good the run was; frames whose pose was not measured are in no error."""
     measured, path = np.array(record.measured), record.trajectory
+    if missing := int((~np.isin(path.stamps, final.stamps)).sum()) if len(final) else 0:
+        logger.warning(
+            "the back end's trajectory() lacks %d of %d frames: it needs a pose for each", missing, len(path)
+        )
     online, steps = path.select(measured), np.diff(path.positions, axis=0)
     speeds = np.linalg.norm(steps, axis=1) / np.diff(path.stamps)
     common = [record.common[row] for row in np.flatnonzero(measured)]
