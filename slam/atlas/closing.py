@@ -36,27 +36,35 @@ def close(atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Traject
     """
     given, common = atlas, None if atlas.solved is None else atlas.solved.belief(rig)[0]
     between = any(x.first < loop.second and x.second > loop.first for x in atlas.loops)
-    limit = _AMONG_LOOPS if between else _FROM_PATH
+    limit, waiting = _AMONG_LOOPS if between else _FROM_PATH, replace(atlas, pending=loop, confirmed=False)
 
-    def without_it(atlas: Atlas) -> tuple[Chain, PoseGraph, float]:
-        """The path, the pose graph without the loop, and the loop's distance from it."""
-        chain = atlas.chain(rig, path())
+    def without_it(atlas: Atlas, revised: Trajectory | None) -> tuple[Chain, PoseGraph, float]:
+        """The path as estimated at the time or `revised`, the graph without the loop, the loop's distance from it."""
+        chain = atlas.chain(rig, revised)
         graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain.poses), loop.pair, common)
         return chain, graph, disagreement(graph, loop)
 
+    def aside(chain: Chain, graph: PoseGraph, off: float) -> Atlas | None:
+        """The atlas if the loop waits for another one, or adds nothing; None if it is to be closed."""
+        if not _agree(chain, given.pending, loop):
+            return waiting.with_inactive_loop(loop)
+        known = off <= limit and given.loops and not is_informative(graph, loop)
+        return replace(waiting, confirmed=True).with_inactive_loop(loop) if known else None
+
     try:
-        chain, graph, off = without_it(atlas)
+        found = without_it(atlas, None)  # the revised path is dear in some back ends, and most loops need none
+        if found[2] <= limit and (done := aside(*found)) is not None:
+            return done
+        revised = path()
+        chain, graph, off = without_it(atlas, revised)
         if off > limit and not (same_view and np.isfinite(off)):
             return _refused(atlas, chain, loop, rig)
-        before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
-        if not _agree(chain, before, loop):
-            return atlas.with_inactive_loop(loop)
-        atlas = replace(atlas, confirmed=True)
+        if (done := aside(chain, graph, off)) is not None:
+            return done
+        atlas = replace(waiting, confirmed=True)
         if off > limit:
             atlas = atlas.inflated(loop.first, loop.second, off / _DIMENSIONS)
-            chain, graph, _ = without_it(atlas)
-        elif atlas.loops and not is_informative(graph, loop):
-            return atlas.with_inactive_loop(loop)
+            chain, graph, _ = without_it(atlas, revised)
         # one that was the first may be farther off the path than those that came after it
         limits = np.where(graph.disagreement() > _AMONG_LOOPS, _FROM_PATH, _AMONG_LOOPS)
         graph = graph.with_loop(loop)
