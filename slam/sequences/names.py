@@ -140,9 +140,9 @@ def _moments(names: Sequence[str]) -> IntArray | None:
             keys = np.array(whole, "datetime64[ns]").astype(np.int64)
         except ValueError:  # no date
             continue
-        keys += np.array([int(match[7].ljust(9, "0")) for match in found])
+        keys += np.array([int(match[7].ljust(9, "0")) for match in found], np.int64)
         if len(set(keys)) == len(names) and median(_steps(keys.tolist()) or [np.inf]) > _SHORTEST:  # else they count
-            return keys
+            return np.asarray(keys)
     return None
 
 
