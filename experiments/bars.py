@@ -101,7 +101,10 @@ def main() -> int:
         return 0
     given.out.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    print("Medians over perturbations, errors in mm: ATE, in the library the closing error, no place recognised.")
+    print(
+        "Medians of five runs, each with another first frame, pixel noise and number of features, in mm: ATE; in the "
+        "library the distance of the last from the first position, without loops."
+    )
     print("\n" + table(found))
     return 0
 

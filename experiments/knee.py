@@ -59,7 +59,7 @@ NAMES = {"asked": "features", "in view": "landmarks in view"}
 FOLLOWED = """
 On drives the landmarks in view are at the knee. There are more features than the path needs in the mean: with the
 fewest, a drive is much farther off, and moving cars are followed for fewer frames. For hand-held cameras the usual
-numbers stay: MH_01 is as good with fewer of both, V1_01 and the desk are not. Nothing moves there: bodies are false.
+numbers stay: MH_01 is as good with fewer of both, V1_01 and the desk are not.
 """
 
 Row = dict[str, str]
@@ -202,10 +202,10 @@ def main() -> int:
     tables = {kind: table(rows, kind) for kind in USUAL}
     show(given.out / "knee.json", COLUMNS, [row for shown, _ in tables.values() for row in shown], 2)
     done = Counter(name for name, _ in {(row["sequence"], row["trial"]) for row in rows})
-    print("\nTrials:", ", ".join(f"{name} {count}" for name, count in sorted(done.items())) + ".")
-    for kind, (_, knees) in tables.items():
-        for what, number in knees.items():
-            print(f"\nKnee of the error, {kind}, {NAMES[what]}: {number}.")
+    found = [
+        f"{number} {NAMES[what]} ({kind})" for kind, (_, knees) in tables.items() for what, number in knees.items()
+    ]
+    print(f"\nTrials: {dict(sorted(done.items()))}; knees of the error: {', '.join(found)}", file=sys.stderr)
     if not given.quick:
         print(FOLLOWED)
     return 0

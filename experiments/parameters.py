@@ -3,7 +3,8 @@
     python experiments/parameters.py [--page docs/parameters.md] [--sensitivity FILE]
 
 Writes the page from the constants' own comments and from what `experiments/sensitivity.py` measured, where its table is
-given. A constant's comment says what it is, its unit in brackets, and where it comes from.
+given; constants that are gone are taken out of that table. A constant's comment says what it is, its unit in brackets,
+and where it comes from.
 """
 
 from __future__ import annotations
@@ -29,31 +30,29 @@ ROOMS = (
 INTRODUCTION = """# Parameters
 
 The named numbers in the algorithms that are not settings (`slam settings` lists those): how many there are of each
-kind, and the chosen ones that change a result beyond the scatter. The others have their reasons in the code. Made by
-`python experiments/parameters.py`.
+kind, and the choices that change a result. Reasons are in the code. Made by `python experiments/parameters.py`.
 """
 
 #: What kinds of numbers there are; a constant's comment begins with its kind, and is a choice where it does not.
 KINDS = {
-    "choice": "a threshold, a prior or a share that was chosen: these are what the columns ½ and 2 are for",
+    "choice": "a threshold, a prior or a share that was chosen",
     "derived": "a quantile of χ² of the probability named with it",
     "paper": "as published",
-    "fixed": "what the thing is: the size of a state, the form of a file, the fewest points that give a pose",
-    "guard": "a bound of what is believed, or from where on a warning is given: what lies beyond is broken input",
-    "numerics": "iterations at most, tolerances, and small terms that keep a matrix invertible",
+    "fixed": "the size of a state, the form of a file, the fewest points that give a pose",
+    "guard": "a bound of what is believed: what lies beyond is broken input",
+    "numerics": "iterations, tolerances, terms that keep a matrix invertible",
     "cost": "how much time or memory something may take",
 }
 
 SENSITIVITY = """\
-The columns ½ and 2 say what happens where the number is half and twice as large: the error of the camera's position and
-of the bodies' motion, as ratios to that with the default, the worse of two back ends, geometric mean over short runs of
-{cases} (`python experiments/sensitivity.py`). Under small perturbations of the pixels errors scatter by factors of
-{camera:.2f} and {bodies:.2f}. "same": the same bytes; "fails": a run did not end, or lost the camera or the bodies;
-"not read": none of these runs comes to the code; empty: not measured.
+The columns ½ and 2 are for half and twice the number: the error of the camera's position and of the bodies' motion,
+over that with the default; the worse of two back ends, geometric mean over short runs of {cases} (`python
+experiments/sensitivity.py`). A number changes a result if one of these is beyond the scatter under small perturbations
+of the pixels, factors of {camera:.2f} and {bodies:.2f}, or if a run fails.
 """
 
 #: What a number does at half or twice its value, by column of the summary.
-OUTCOMES = ("same", "within the scatter", "beyond it", "fails", "not read", "not measured")
+OUTCOMES = ("changes a result", "does not", "not measured")
 
 
 @dataclass(frozen=True)
@@ -136,8 +135,7 @@ def page(parameters: list[Parameter], sensitivity: dict[str, Any]) -> str:
         lines += ["", SENSITIVITY.format(cases=cases, **scatter)]
     lines += ["## Choices", "", _row(["name", "value", "what it is", "½", "2"]), "| --- | ---: | --- | ---: | ---: |"]
     file = ""
-    shown = ("beyond it", "fails")
-    for p in (p for p in parameters if p.kind == "choice" and _outcome(measured[p], scatter) in shown):
+    for p in (p for p in parameters if p.kind == "choice" and _outcome(measured[p], scatter) == OUTCOMES[0]):
         if p.file != file:
             file = p.file
             lines.append(_row([f"**{file}**", "", "", "", ""]))
@@ -151,14 +149,8 @@ def _outcome(measured: list[dict[str, Any]] | None, scatter: dict[str, float]) -
     if not measured:
         return "not measured"
     values = [(k, v) for side in measured for k, v in side.items()]
-    words = {v for _, v in values if isinstance(v, str)}
-    if "fails" in words:
-        return "fails"
-    if any(isinstance(v, float) and not 1 / scatter[k] <= v <= scatter[k] for k, v in values):
-        return "beyond it"
-    if any(isinstance(v, float) for _, v in values):
-        return "within the scatter"
-    return "same" if "same" in words else "not read"
+    beyond = (isinstance(v, float) and not 1 / scatter[k] <= v <= scatter[k] for k, v in values)
+    return OUTCOMES[0] if any(beyond) or "fails" in (v for _, v in values) else OUTCOMES[1]
 
 
 def _row(cells: list[str]) -> str:
@@ -178,7 +170,12 @@ def main() -> int:
     parser.add_argument("--sensitivity", type=Path, default=ROOT / "docs" / "sensitivity.json")
     arguments = parser.parse_args()
     table = json.loads(arguments.sensitivity.read_text()) if arguments.sensitivity.exists() else {}
-    arguments.page.write_text(page(find(), table), encoding="utf-8")
+    parameters = find()
+    if table:
+        present = {f"{p.module}:{p.name}" for p in parameters}
+        table["ratios"] = {name: each for name, each in table["ratios"].items() if name in present}
+        arguments.sensitivity.write_text(json.dumps(table, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    arguments.page.write_text(page(parameters, table), encoding="utf-8")
     return 0
 
 

@@ -61,12 +61,3 @@ def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(runs):
     summary = run_.summary["accuracy"]["online"]
     assert np.sqrt(np.mean(error[:, 1] ** 2)) == pytest.approx(summary["rotation RMSE from start [deg]"], rel=1e-3)
     assert (error[1:, 1] < 5 * sigma[1:, 1]).all() and (sigma[1:, 1] > 0).all()
-
-
-def test_truth_that_was_not_measured_is_no_error_in_the_picture(runs, monkeypatch):
-    """The first steps of KITTI 06 are extrapolated, which the verdict leaves out."""
-    monkeypatch.setattr("slam.run.run_data.interpolated", lambda true, noise: np.arange(len(true)) < 3)
-    run_ = RunData.read(runs / "a", "a")
-    time, error, _ = pose_errors(run_)
-    assert time[0] == pytest.approx(run_.online.stamps[3] - run_.online.stamps[0])
-    np.testing.assert_allclose(error[0], 0, atol=1e-9)

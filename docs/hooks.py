@@ -1,4 +1,4 @@
-"""For the site: links of notebooks go to the pages as they are built; lists of API pages, which are for others, go."""
+"""For the site: links of notebooks go to the pages as they are built; lists of names become their documentation."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 
 from mkdocs.exceptions import PluginError
 
-_LISTED = re.compile(r"^\[`[\w.]+`\]\(\.\./\.\./.*\n", re.MULTILINE)
+_LISTED = re.compile(r"^- \[`([\w.]+)`\]\(\.\./\.\./.*\n", re.MULTILINE)
 _LINK = re.compile(r'href="([^":#]+\.(?:md|ipynb))')
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """An API page's text without the lists of `make_api`: mkdocstrings shows all that."""
-    return _LISTED.sub("", markdown) if page.file.src_uri.startswith("api/") else markdown
+    """An API page's text with mkdocstrings in place of the lines of `make_api`."""
+    return _LISTED.sub(r"::: \1\n\n", markdown) if page.file.src_uri.startswith("api/") else markdown
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
