@@ -10,6 +10,7 @@ import slam
 from slam.calibration import RigModel, RigPosterior
 from slam.calibration.corrected import corrected_rig
 from slam.errors import SlamError
+from slam.run import calibrating
 from slam.run.calibrating import _judged
 from tests.scripts import command
 
@@ -68,6 +69,19 @@ def test_a_correction_is_advised_only_where_it_is_expected_to_help(off, sigma, a
     words, worth = _judged(model, posterior, 0.4, 100.0, differing)
     assert worth == (word in ("This is worth correcting", "This is bad"))  # only then it is said how to use it
     assert f"{off:.2f} ± {sigma:.2f} px in disparity" in words and word in words
+
+
+def test_a_recording_that_is_left_out_has_no_numbers(tmp_path, monkeypatch):
+    run = calibrating._run
+
+    def standing(sequence, *given):
+        found, evidence = run(sequence, *given)
+        return found | {"pairs": 0 if "seed=1" in sequence.name else 3}, evidence
+
+    monkeypatch.setattr(calibrating, "_run", standing)
+    printed = command("calibrate", WORLD, f"{WORLD}&seed=1", "--out", tmp_path / "rig.json")
+    assert re.search(r"right_f +│ % +│ [^│]*± [^│]*│ [^│]*± [^│]*│ +– │", printed)
+    assert "left out" in " ".join(printed.split())
 
 
 def test_it_is_the_prior_of_a_run(made, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -135,7 +136,11 @@ def test_a_vehicle_that_goes_sideways_is_doubted():
 
 
 @pytest.mark.parametrize(("doubt", "status"), [("", 0), ("rows do not agree", 1)])
-def test_a_path_that_cannot_be_trusted_does_not_look_like_one_that_can(doubt, status, tmp_path, capsys):
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_path_that_cannot_be_trusted_does_not_look_like_one_that_can(
+    doubt, status, terminal, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     summary = {"frames": 9, "status": {"tracked": 8}, "tracking": "", "doubt": doubt, "path_length_m": 1.0}
     try:
         finish(summary, [Output(tmp_path, "--out", [])], picture=False, quiet=True)
@@ -143,4 +148,5 @@ def test_a_path_that_cannot_be_trusted_does_not_look_like_one_that_can(doubt, st
     except typer.Exit as end:
         code = end.exit_code
     assert code == status
-    assert capsys.readouterr().err == (f"slam: do not trust this path: {doubt}\n" if doubt else "")
+    said = f"slam: do not trust this path: {doubt}"
+    assert capsys.readouterr().err == (f"\x1b[31m{said}\x1b[0m\n" if terminal else f"{said}\n") * bool(doubt)

@@ -78,3 +78,11 @@ def test_figures_of_bodies_are_means_over_those_that_were_in_view():
     assert found["body_coverage"] == pytest.approx(0.6) and found["body_nees_per_dof"] == pytest.approx(2.0)
     assert found["moving_precision"] == 0.5
     assert "moving_precision" not in figures(summary(1.0) | {"objects": {"features": {"precision": 0.5}, "bodies": {}}})
+
+
+def test_runs_that_are_not_to_be_trusted_are_a_row_of_a_comparison_where_there_are_any(tmp_path):
+    plan, trial = Plan(("synthetic:desk",), ("ekf",)), Trial("synthetic:desk", "ekf")
+    for doubt in ("", "rows do not agree"):
+        found = figures(summary(1.0) | {"doubt": doubt})
+        (group,) = groups(plan, [Run(trial, "completed", found, {}, tmp_path)])
+        assert ("runs not to be trusted [%]" in [metric.title for metric in group.metrics]) == bool(doubt)

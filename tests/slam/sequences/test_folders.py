@@ -32,7 +32,11 @@ NAMES = {  # of the left and the right images, and the stamps that they say; pla
     "seconds since a start": ("{:.3f}", "{:.3f}", lambda i: 9.95 + 0.05 * i, 9.95, 0.05),
     "unpadded": ("c-1700000000.{}", "c-1700000000.{}", lambda i: 97000 + 1500 * i, 1.7e9 + 0.097, 0.0015),
     "whole seconds": ("{}", "{}", lambda i: 1_600_000_000 + i, 1.6e9, 1.0),
-    "ISO": ("2023-04-05T12:00:{:02d}.250000Z",) * 2 + (lambda i: 57 + i, 0.0, 0.1),
+    "ISO": ("2023-04-05T12:00:{:02d}.250000Z",) * 2 + (lambda i: i, 1680696000.25, 1.0),
+    "date and time": ("20230405_120000_{:03d}",) * 2 + (lambda i: 90 * i, 1680696000, 0.09),
+    "two dates": ("2018-07-09-16-11-56_2018-07-09-16-11-5{0[0]}-{0[1]:03d}",) * 2
+    + (lambda i: divmod(6700 + 110 * i, 1000), 1531152716.7, 0.11),
+    "date of the session": ("20230405_120000_{:03d}",) * 2 + (lambda i: i, 0.0, 0.1),
     "time of day behind a date": ("20230405_{0[0]:06d}.{0[1]:02d}",) * 2 + (lambda i: (120057 + i, 25), 0.0, 0.1),
     "malaga": ("img_C1_{:.6f}_left", "img_C1_{:.6f}_right", lambda i: 1261228749.91 + 0.04 * i, 1261228749.91, 0.04),
     "inside, since a start": ("left_{:.3f}", "right_{:.3f}", lambda i: 12.85 + 0.05 * i, 12.85, 0.05),
