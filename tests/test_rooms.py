@@ -45,7 +45,7 @@ MAY_IMPORT = {
 
 #: The root's modules by room; all others are "base".
 ROOT_ROOMS = {
-    "data": {"checks", "third_party", "data", "interfaces", "models", "object_data"},
+    "data": {"checks", "third_party", "guarded", "data", "interfaces", "models", "object_data"},
     "system": {"system", "session", "tracker", "config"},
     "commands": {"__main__"},
     "outside": {"__init__"},

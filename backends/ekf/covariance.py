@@ -179,7 +179,8 @@ class Covariance:
             J: the camera's error becomes J (12, 12) times what it was,
             shift: and then to those of the state's landmarks this (A, 3, 6) times that of the pose is added.
         """
-        P, by_rig, b, shift = self.P.copy(), self.by_rig.copy(), self.begin, shift.reshape(-1, POSE)
+        P, by_rig, b, shift = np.empty_like(self.P), self.by_rig.copy(), self.begin, shift.reshape(-1, POSE)
+        P[:b] = self.P[:b]
         P[:CAMERA] -= V[:CAMERA] @ V.T
         P[CAMERA:b, b:] -= V[CAMERA:b] @ V[b:].T
         by_rig[:CAMERA], by_rig[b:] = by_rig[:CAMERA] - V[:CAMERA] @ lost_by_rig, by_rig[b:] - V[b:] @ lost_by_rig
@@ -189,7 +190,7 @@ class Covariance:
         gone, across = V[b:] @ V[b:].T, (P[:POSE, b:].T + 0.5 * shift @ own[:POSE, :POSE]) @ shift.T
         gone -= across
         gone -= across.T
-        P[b:, b:] -= gone
+        np.subtract(self.P[b:, b:], gone, out=P[b:, b:])
         summands = self.P.diagonal()[b:] + ((shift @ own[:POSE, :POSE]) * shift).sum(axis=1)
         positive(P[b:, b:], summands, V.shape[1])
         P[:CAMERA, :CAMERA] = own

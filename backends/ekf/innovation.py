@@ -190,8 +190,10 @@ class Innovation:
         spanned by their columns of L⁻¹, it is ``(1 − A Aᵀ) L⁻¹ ν``, whose square is the ``νᵀ S⁻¹ ν`` of these alone.
         """
         out = np.flatnonzero(np.repeat(~used, 3))
+        if not len(out):
+            return Whitened(self, used, self.inverse[:, out], self.inverse)
         A = np.linalg.qr(self.inverse[:, out])[0]
-        root = self.inverse - A @ (A.T @ self.inverse) if len(out) else self.inverse.copy()
+        root = self.inverse - A @ (A.T @ self.inverse)
         root[:, out] = 0.0
         return Whitened(self, used, A, root)
 

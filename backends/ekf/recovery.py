@@ -36,7 +36,8 @@ def agreement(update: Update, search: Search) -> Posterior | None:
         raise UnsolvableError("the predicted state is not finite")
     found, error, majority = None, None, (len(update.z) + 1) // 2
     least = max(MIN_OBSERVATIONS, majority)  # what passes the gate; in the end `solve` takes out what disagrees
-    for T, passing in [(None, least), (update.guess, least), (None, 0)][:: 2 if update.guess is None else 1]:
+    starts = [(None, least), (None, 0)] if update.guess is None else [(None, least), (update.guess, least), (None, 0)]
+    for T, passing in starts:
         try:
             gated = gate(update, T)
             agreed = _agreed(gated) if gated.used.sum() >= passing else None

@@ -3,23 +3,21 @@
 import numpy as np
 
 from slam.data import Estimate, Prediction, UpdateReport, UpdateStatus
-from slam.errors import MeasurementError
 from slam.geometry.rig import measurement_rows
 from slam.geometry.se3 import inverse, transform
 from slam.geometry.trajectory import Trajectory
-from slam.models import EstimatorModels
+from slam.guarded import guarded
 from slam.window.consensus import find_consensus
 
 
+@guarded
 class PoseFit:
-    def __init__(self, rig, models=None):
-        self.rig, self.models = rig, models or EstimatorModels()
-        self.T, self.P = np.eye(4), 1e-4 * np.eye(6)  # T_world_left and its covariance: guessed, not estimated
+    def __init__(self, rig, models):
+        self.rig, self.models = rig, models
+        self.T, self.P = models.initial_pose, 1e-4 * np.eye(6)  # T_world_left, and its covariance: guessed
         self.points, self.stamps, self.poses = {}, [], []
 
     def predict(self, stamp):
-        if self.stamps and not stamp > self.stamps[-1]:
-            raise MeasurementError(f"time {stamp} is not later than {self.stamps[-1]}")
         self.stamps.append(stamp)
         self.poses.append(self.T)  # the camera stays where it is: no model of motion
         ids = np.array(sorted(self.points), np.int64)

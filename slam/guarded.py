@@ -1,0 +1,99 @@
+"""What a back end need not write itself: a class decorator that refuses misuse, as `slam.interfaces.Backend` asks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from inspect import Parameter, signature
+from typing import Any
+
+import numpy as np
+
+from slam.checks import require_guess, require_not_measured, require_stamp
+from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
+from slam.errors import ConfigurationError, MeasurementError
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.geometry.trajectory import Trajectory
+from slam.models import EstimatorModels
+
+
+def guarded(backend: Any) -> Any:
+    """A back end's class behind one that calls it only where `slam.interfaces.Backend` allows it.
+
+    Refused, and nothing changed, are options that its constructor does not name, stamps that do not increase, calls
+    before the first `predict`, ids that are not in the map, or to be added and in it, new landmarks without a depth, a
+    second update of a stamp or one after an `add`, and guesses that are no pose. An update without rows is EMPTY.
+    Answers are copies: what the caller writes into them does not reach the back end.
+    """
+    name, parameters = backend.__name__, signature(backend).parameters.values()
+    any_option = any(p.kind is Parameter.VAR_KEYWORD for p in parameters)
+
+    class Guarded:
+        def __init__(self, rig: StereoRig, models: EstimatorModels | None = None, **options: Any) -> None:
+            unknown = set(options) - {p.name for p in parameters}
+            if unknown and not any_option:
+                raise ConfigurationError(f"{name}: unknown option {min(unknown)!r}")
+            self._backend, self._rig = backend(rig, models or EstimatorModels(), **options), rig
+            self._ids, self._measured, self._stamp = set[int](), True, float("nan")
+
+        def __getattr__(self, attribute: str) -> Any:  # what else the back end has
+            if attribute.startswith("_"):
+                raise AttributeError(attribute)
+            return getattr(self._backend, attribute)
+
+        def _require(self, ids: IdArray | Sequence[int] = (), known: bool = True) -> list[int]:
+            """Ids as numbers; raises MeasurementError before the start, or where one is not in the map, or in it."""
+            if np.isnan(self._stamp):
+                raise MeasurementError(f"{name}: the first call is predict")
+            numbers: list[int] = np.asarray(ids, np.int64).tolist()
+            for i in numbers:
+                if (i in self._ids) is not known:
+                    raise MeasurementError(f"{name}: landmark {i} is {'not in' if known else 'already in'} the map")
+            return numbers
+
+        def predict(self, stamp: float) -> Prediction:
+            require_stamp(name, stamp, None if np.isnan(self._stamp) else self._stamp)
+            found: Prediction = deepcopy(self._backend.predict(float(stamp)))
+            self._stamp, self._measured = float(stamp), False
+            return found
+
+        def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
+            self._require(observations.ids)
+            require_not_measured(name, self._measured)
+            require_guess(name, guess)
+            report = UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
+            report = self._backend.update(observations, guess) if len(observations) else report
+            self._measured = True
+            return report
+
+        def add(self, observations: Observations) -> None:
+            ids = self._require(observations.ids, known=False)
+            if not np.isfinite(self._rig.triangulate(observations.uv_left, observations.uv_right)).all():
+                raise MeasurementError(f"{name}: a landmark has no right pixel or no positive depth")
+            if ids:
+                self._backend.add(observations)
+                self._ids, self._measured = self._ids | set(ids), True
+
+        def remove(self, ids: IdArray | Sequence[int]) -> None:
+            gone = self._require(ids)
+            self._backend.remove(np.array(gone, np.int64))
+            self._ids = self._ids - set(gone)
+
+        def positions(self, ids: IdArray) -> Array:
+            self._require(ids)
+            found: Array = deepcopy(self._backend.positions(ids))
+            return found
+
+        def estimate(self, landmarks: bool = True) -> Estimate:
+            self._require()
+            found: Estimate = deepcopy(self._backend.estimate(landmarks))
+            return found
+
+        def trajectory(self) -> Trajectory:
+            found: Trajectory = deepcopy(self._backend.trajectory())
+            return found
+
+    for attribute in ("__name__", "__qualname__", "__module__", "__doc__"):  # it is found and named as that class
+        setattr(Guarded, attribute, getattr(backend, attribute))
+    return Guarded
