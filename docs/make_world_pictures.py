@@ -15,7 +15,6 @@ FOLDER = Path(__file__).parent / "images" / "worlds"
 PICTURES = {
     "aisle": ("box=1", (0, 420, 830)),
     "desk": ("", (0, 180, 520)),
-    "field": ("", (60, 350, 640)),
     "startup": ("", (0, 75, 149)),
     "box": ("", (10, 120, 220, 360)),
     "boxes": ("", (60, 200, 330)),

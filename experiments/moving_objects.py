@@ -205,7 +205,7 @@ def ids_about(seed: int, backend: str, frames: int) -> tuple[set[int], set[int],
 def still(quick: bool, out: Path) -> list[dict[str, Any]]:
     """Nothing moves: whatever is found is wrong. Medians over ten seeds."""
     seeds, frames = (1, 15) if quick else (10, 100)
-    worlds = ("aisle?speed=2&", "desk?density=200&", "field?", "street?cars=0&")
+    worlds = ("aisle?speed=2&", "desk?density=200&", "street?cars=0&")
     return [scored_run(f"{w}seed={seed}", "ekf", frames)[0] for w in worlds for seed in range(seeds)]
 
 

@@ -90,7 +90,7 @@ PAGES = {
     ),
     "cost": (
         "Cost",
-        "What does a frame cost, next to others, and how does that grow?",
+        "What does a frame cost, next to others?",
         "On a drive about half of the CPU time of SIFT for one image, on small images nearly as much, however long the "
         "run.",
     ),
@@ -143,7 +143,6 @@ EXPERIMENTS = (
         "descriptors", "papers", "16 and 64 dimensions, known points (A, III.B, first experiment)",
         "16-D takes 45 % less time for 100 to 800 features, and is best in the estimation of known points; no figures "
         "of the latter are printed.",
-        {"descriptors": "Left: time of description. Right: error of the map's points, a line for each seed."},
     ),
     Experiment(
         "aisle", "papers", "The bookshelf aisle (A, V, Figs. 5 and 6)",
@@ -158,10 +157,6 @@ EXPERIMENTS = (
         "startup", "papers", "Start-up from stored features (B, 4.2, Fig. 6)",
         "Camera truly at [3, −70, 2.7] cm, started at [0, 0, 0]: stopped at [0, −55.8, 3.7], 15 cm off.",
         {"startup": "Left and middle: from three wrong starts to the true place in one frame. Right: the error then."},
-    ),
-    Experiment(
-        "walking_robot", "papers", "Walking robot (B, 4.3, Fig. 8)",
-        "Map and states in 3D; no ground truth, no figures.", {"errors": ERRORS},
     ),
     Experiment(
         "moving_objects", "objects", "Moving box, moving objects (B, 4.4, Table 1, Fig. 10)",
@@ -185,12 +180,6 @@ EXPERIMENTS = (
         "`cv2.SIFT` on one image and to ORB-SLAM3 on the same images; with overlap, times from one result to the next. "
         "CPU time adds up all threads.",
         left_out=("ATE [mm]", "frames lost", "wall [ms]", "wall / SIFT", "wall / ORB-SLAM3"),
-    ),
-    Experiment(
-        "growth", "cost", "How it grows", folder="benchmarks", pictures={"growth": "Floors are dashed."},
-        says="CPU time over the number of landmarks, features and moving cars, and of what cannot be done "
-        "without (floor, dashed): the filter's bare `dsyrk`, gtsam's own calls, SURF alone, no detector.",
-        left_out=("by",),
     ),
     Experiment(
         "command", "cost", "Whole runs", folder="benchmarks",

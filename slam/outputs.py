@@ -11,7 +11,6 @@ import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from itertools import permutations
 from pathlib import Path
 
 from slam.errors import SlamError
@@ -32,11 +31,6 @@ class Output:
     makes_folder: bool = False  # the folders above a file are made where they are missing; those of a folder always are
 
     @property
-    def is_folder(self) -> bool:
-        """Whether it is a folder."""
-        return self.names is not None
-
-    @property
     def real(self) -> Path:
         """The path with all links followed."""
         return Path(os.path.realpath(self.path))
@@ -48,7 +42,7 @@ class Output:
     @property
     def present(self) -> list[Path]:
         """What of it is there already."""
-        if not self.is_folder:
+        if self.names is None:
             return [self.path] if self.path.exists() else []
         return sorted(path for path in self.path.iterdir() if self.writes(path.name)) if self.path.is_dir() else []
 
@@ -59,16 +53,14 @@ def require_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = (), over
     `inputs` are files that the command reads, and folders whose files it reads: these are never replaced, others if
     `overwrite` is true, which is None for a command without such an option.
     """
-    for output in outputs:
-        if "\0" in str(output.path):
-            raise SlamError(f"{output.path}: no possible file name")
+    if nul := next((output.path for output in outputs if "\0" in str(output.path)), None):
+        raise SlamError(f"{nul}: no possible file name")
     read = [Path(os.path.realpath(path)) for path in inputs]
-    made = {output.real for output in outputs if output.is_folder}
+    made = {output.real for output in outputs if output.names is not None}
     for output in outputs:
         try:
-            if fault := _impossible(output, made):
-                raise SlamError(f"{output.path}: cannot be written: {fault}")
-            filled = output.is_folder and output.path.is_dir() and next(output.path.iterdir(), None) is not None
+            _require_place(output, made)
+            filled = output.names is not None and output.path.is_dir() and any(output.path.iterdir())
             for path in [*output.present, *([output.path] if filled else [])]:
                 if any(_is_input(path, file) for file in read):
                     raise SlamError(f"{path}: is an input, or in a folder of inputs; give another {output.option}")
@@ -76,13 +68,14 @@ def require_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = (), over
                 if not overwrite:
                     allow = "" if overwrite is None else ", or --overwrite to replace it"
                     raise SlamError(f"{path}: is there already; give another {output.option}{allow}")
-                if output.names is not None and path.exists():
+                if output.names is not None:
                     _require_kind(path, path.name not in output.names and f"{path.name}/" in output.names)
         except OSError as fault:
             raise SlamError(f"{output.path}: cannot be written: {reason(fault)}") from fault
-    for one, other in permutations(outputs, 2):
-        if _clash(one, other):
-            raise SlamError(f"{one.path}: {one.option} and {other.option} cannot write to the same place")
+        for one in outputs:
+            inside = one.names is not None and output.real.parent == one.real and one.writes(output.real.name)
+            if one is not output and (inside or one.real == output.real):
+                raise SlamError(f"{output.path}: {one.option} and {output.option} cannot write to the same place")
 
 
 def _require_kind(path: Path, folder: bool) -> None:
@@ -92,28 +85,20 @@ def _require_kind(path: Path, folder: bool) -> None:
         raise SlamError(f"{path}: cannot be written: there is something that is not a {kind}")
 
 
-def _impossible(output: Output, made: set[Path]) -> str:
-    """Why an output cannot be written; empty where it can. `made` are folders that other outputs make."""
-    path, exists = output.path, False
-    try:
-        exists = bool(path.stat().st_mode)
-    except (FileNotFoundError, NotADirectoryError):
-        if output.is_folder and path.is_symlink():
-            return "a link to a folder that is not there"
+def _require_place(output: Output, made: set[Path]) -> None:
+    """Raise where there is something else, or no folder to write to; `made` are folders that other outputs make."""
+    path, exists = output.path, os.path.lexists(output.path)
     if exists:
-        _require_kind(path, output.is_folder)
+        path.stat()  # raises for a link to nothing, or in a circle
+        _require_kind(path, output.names is not None)
         if not os.access(path, os.W_OK):
-            return "Permission denied"
-    place = path if output.is_folder and exists else output.real.parent
-    near = next(folder for folder in path.absolute().parents if os.path.lexists(folder))
+            raise PermissionError(13, "Permission denied")
+    place = path if output.names is not None and exists else output.real.parent
     above = next(folder for folder in (place, *place.absolute().parents) if os.path.lexists(folder))
-    for folder in (near, above):
-        if not folder.is_dir():  # such as a link to nothing
-            return f"{folder} is not a folder"
-    if above != place and not output.is_folder and not output.makes_folder and place not in made:
-        return f"there is no folder {path.parent}"
+    if above != place and output.names is None and not output.makes_folder and place not in made:
+        raise SlamError(f"{path}: cannot be written: there is no folder {path.parent}")
     with tempfile.TemporaryFile(dir=above):  # permissions alone do not say it
-        return ""
+        pass
 
 
 def _is_input(path: Path, file: Path) -> bool:
@@ -125,14 +110,3 @@ def _is_input(path: Path, file: Path) -> bool:
         return False
     between = [folder for folder in (real, *real.parents) if folder != file and folder.is_relative_to(file)]
     return not any(all((f / name).is_file() for name in names) for f in between for names in _OURS)
-
-
-def _clash(one: Output, other: Output) -> bool:
-    """Whether the first output would be one of the other's files, or lie in a file or folder of the other's."""
-    inner, outer = one.real, other.real
-    same = inner == outer or (one.path.exists() and other.path.exists() and one.path.samefile(other.path))
-    if same and one.names is not None and other.is_folder:
-        return any(other.writes(name.rstrip("/")) for name in one.names)
-    if same or not other.is_folder:
-        return same or inner.is_relative_to(outer)
-    return inner.is_relative_to(outer) and other.writes(inner.relative_to(outer).parts[0])

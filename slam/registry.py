@@ -11,7 +11,6 @@ Without a package, ``my_module:MyBackend`` is a name as well; the module may be 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib import import_module
@@ -120,54 +119,31 @@ def create(role: str, name: str, rig: Any, /, **options: Any) -> Any:
         del options["models"]
     try:
         created = made(rig, **options)
+    except SlamError:
+        raise
     except (Exception, SystemExit) as error:  # whatever a foreign class does
-        wrong = _unknown_option(made, rig, options) if isinstance(error, (TypeError, ConfigurationError)) else ""
-        if isinstance(error, SlamError) and not wrong:
-            raise
-        raise ConfigurationError(f"{what}{wrong or f' cannot be created: {cause(error)}'}") from error
+        known = ", ".join(options_of(made, rig))
+        hint = f"; its options are {known}" if known and isinstance(error, TypeError) else ""
+        raise ConfigurationError(f"{what} cannot be created: {cause(error)}{hint}") from error
     return require_methods(role, created, repr(name))
 
 
-def options_of(made: Any, rig: Any) -> dict[str, tuple[Any, Any]] | None:
+def options_of(made: Any, rig: Any) -> dict[str, tuple[Any, Any]]:
     """Options of a back end's or front end's class: by name the default, and what has them in its docstring.
 
-    They are the arguments of its constructor but the rig, ``models``, and functions. Where that takes any others, they
-    are also the arguments of the constructors that it inherits from, and the fields of its ``config``. None where a
-    class takes any and does not say which.
+    They are the arguments of its constructor but the rig, ``models``, and functions, and where that takes any others
+    the fields of its ``config``.
     """
-    found: dict[str, tuple[Any, Any]] = {}
-    closed = True
     try:
-        bases = [base for base in made.__mro__[:-1] if "__init__" in vars(base)] if isinstance(made, type) else [made]
-        for one in bases:
-            parameters = list(signature(one).parameters.values())[1:]
-            named = (p for p in parameters if p.kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY))
-            values = {p.name: None if p.default is Parameter.empty else p.default for p in named if p.name != "models"}
-            found = {name: (value, one) for name, value in values.items() if not callable(value)} | found
-            closed = all(p.kind is not Parameter.VAR_KEYWORD for p in parameters)
-            if closed and one is bases[0]:
-                return found
-            if closed:
-                break
-        config = getattr(made(rig), "config", None)
-        if is_dataclass(config):
-            return found | {f.name: (getattr(config, f.name), type(config)) for f in fields(config)}
-        return found if closed else None
+        parameters = list(signature(made).parameters.values())[1:]
+        named = (p for p in parameters if p.kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY))
+        values = {p.name: None if p.default is Parameter.empty else p.default for p in named if p.name != "models"}
+        found = {name: (value, made) for name, value in values.items() if not callable(value)}
+        config = getattr(made(rig), "config", None) if any(p.kind is p.VAR_KEYWORD for p in parameters) else None
+        of_config = fields(config) if is_dataclass(config) else ()
+        return found | {f.name: (getattr(config, f.name), type(config)) for f in of_config}
     except (Exception, SystemExit):  # noqa: BLE001 (whatever a foreign class does)
-        return None
-
-
-def _unknown_option(made: Any, rig: Any, options: Mapping[str, Any]) -> str:
-    """What is said of the first option that a class does not take; empty where it takes all, or does not say."""
-    known = options_of(made, rig)
-    if known is None:
-        return ""
-    taken = signature(made).parameters
-    if wrong := next((name for name in options if name not in (*known, *taken, "models")), None):
-        return f": {unknown('option', wrong, known)}" if known else f" has no options, got {wrong!r}"
-    if "models" in options and "models" not in taken and all(p.kind is not p.VAR_KEYWORD for p in taken.values()):
-        return " cannot be created: it does not take the argument models"
-    return ""
+        return {}
 
 
 def require_methods(role: str, part: Any, name: str = "") -> Any:

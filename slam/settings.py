@@ -12,7 +12,7 @@ from slam.naming import suggestion, unknown
 _FREE = ("frontend", "backend")  # their options are checked by the front end or back end itself
 
 #: Settings that a user can set, by section, and by name of a front end. The others are the program's own: they are in
-#: ``config.json``, so that a run can be repeated, and change from version to version. All options of back ends, and of
+#: ``config.json``, and change from version to version. All options of back ends, and of
 #: front ends from elsewhere, can be set.
 SETTABLE: dict[str, tuple[str, ...]] = {
     "models": ("motion.acceleration", "motion.angular_acceleration", "pixel_sigma"),

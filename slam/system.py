@@ -22,6 +22,7 @@ from slam.geometry.se3 import transform
 from slam.geometry.trajectory import Trajectory
 from slam.input.extraction import Extracted, Extractor
 from slam.input.features import Rectification, documented, following
+from slam.input.moment import MomentWatch
 from slam.input.warnings import REPEATED
 from slam.interfaces import Backend, Frontend
 from slam.models import EstimatorModels
@@ -122,7 +123,7 @@ class StereoSlam:
         self._tracker = Tracker(inside.rig, inner, self.calibration, first, restarts, detector, self.frontend)
         self._session = Session(self._tracker, names[1])
         self._stages = Stages()
-        self._extractor = Extractor(self.frontend, rig, c.models)
+        self._extractor, self._moment = Extractor(self.frontend, rig, c.models), MomentWatch(inside.rig)
         self._stepping = OneThread("this system")
         if prior_map is not None:
             prior_map.require_fits(self.frontend_name, rig)
@@ -294,6 +295,7 @@ class StereoSlam:
         step = replace(step, repeated=repeated)
         common = tracker.rig_error.common(state.backend, as_reported=True)
         result = frame_result(step, atlas, state.ever_mapped, revision, self._stages.milliseconds, common)
+        self._moment.add(features, step.estimate.T_world_left, result.status.measured)
         self._state, self._stages = state.after(step, atlas, checksum), Stages()
         return out(result)
 
@@ -344,14 +346,15 @@ class StereoSlam:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings about images, stamps or baseline, one line each (see `slam.input.warnings`)."""
-        said = self._extractor.input_warnings
-        return [*said.lines, *filter(None, [said.repeated])]
+        """Warnings about images, stamps, baseline or calibration, one line each (see `slam.input`)."""
+        said, doubt = self._extractor.input_warnings, self.doubt
+        lines = [*said.lines, *filter(None, [said.repeated])]
+        return lines if doubt in ("", *lines) else [*lines, doubt]
 
     @property
     def doubt(self) -> str:
-        """Why no path by these images can be trusted, one of the `warnings`; empty where none says so."""
-        return self._extractor.input_warnings.doubt
+        """Why no path by these images can be trusted, one of the `warnings`; empty where nothing says so."""
+        return self._extractor.input_warnings.doubt or self._moment.doubt or self.calibration.doubt
 
     def __getstate__(self) -> dict[str, object]:
         """State for copying and pickling; refused while another thread is in a step."""

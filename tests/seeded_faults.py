@@ -45,12 +45,12 @@ FAULTS = (
     ),
     Fault(
         "what has left the state keeps its old correlation", "backends/ekf/covariance.py",
-        "cross = self.marks[b:, :b] - V_marks @", "cross = self.marks[b:, :b] - 0.0 * V_marks @",
+        "P[CAMERA:b, b:] -= V[CAMERA:b] @ V[b:].T", "P[CAMERA:b, b:] -= 0.0 * V[CAMERA:b] @ V[b:].T",
         "tests/backends/test_ekf_parts.py tests/backends/test_all_backends.py tests/backends/test_ekf.py",
     ),
     Fault(
         "no process noise", "backends/ekf/covariance.py",
-        "own = head[:CAMERA, :CAMERA] @ J.T + noise", "own = head[:CAMERA, :CAMERA] @ J.T",
+        "own = P[:CAMERA, :CAMERA] @ J.T + noise", "own = P[:CAMERA, :CAMERA] @ J.T",
         "tests/backends/test_ekf.py tests/backends/test_ekf_parts.py",
     ),
     Fault(

@@ -120,6 +120,13 @@ def test_every_page_links_to_what_exists():
                 assert (page.parent / target).exists(), f"{page.relative_to(ROOT)}: {target}"
 
 
+def test_api_pages_say_what_the_docstrings_say():
+    make_api = load_script("docs/make_api.py")
+    for page in (DOCS / "api").glob("*.md"):
+        text = page.read_text(encoding="utf-8")
+        assert make_api.ROW.sub(make_api.row, text) == text, "python docs/make_api.py"
+
+
 def test_sensitivities_are_of_numbers_that_there_are():
     present = {name_of(parameter) for parameter in find()}
     stale = set(json.loads((DOCS / "sensitivity.json").read_text())["ratios"]) - present

@@ -23,7 +23,6 @@ OBSERVED = {
     "aisle?frames=25&sigma=0.7": 0.007,
     "aisle?frames=25&sigma=0.7&rig=toedin": 0.008,
     "desk?frames=25&sigma=0.7": 0.006,
-    "field?frames=25&sigma=0.7": 0.008,
     "startup?frames=25&sigma=0.7": 0.010,
     "box?frames=25&sigma=0.7": 0.010,
     "boxes?frames=25&sigma=0.7": 0.020,

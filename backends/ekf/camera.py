@@ -18,8 +18,7 @@ from slam.models import ANYWHERE, EstimatorModels
 
 _ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an attitude [rad]
 
-#: Of a camera's error (12,), which stands from now on: its velocity is zero for certain.
-AT_REST = np.diag(np.repeat([1.0, 0.0], POSE))
+_AT_REST = np.diag(np.repeat([1.0, 0.0], POSE))  # of a camera's error (12,)
 
 
 class Camera(Protocol):
@@ -60,15 +59,33 @@ class Camera(Protocol):
         If the camera does not transport, the same numbers.
         """
 
-    def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion:
-        """After `dt` [s] of constant velocity, with the error's covariance P (12, 12)."""
+    def advanced(self, dt: float) -> tuple[Self, Array, Array]:
+        """After `dt` [s] of constant velocity: its error is A (12, 12) times what it was and W (12, 6) impulses."""
 
-    def at_rest(self) -> Motion:
-        """After a step of a camera that stands: the pose stays, and the velocity is zero for certain."""
+    def stopped(self) -> Self:
+        """With the same pose, and no velocity."""
+
+    def of_body(self, P: Array) -> Array:
+        """A covariance (12, 12) with turns and rates about the body's axes, the same about all, as one of the error."""
 
 
 #: A camera that has moved; its error is a matrix (12, 12) times what it was, plus noise of a covariance (12, 12).
 Motion = tuple[Camera, Array, Array]
+
+
+def moved(camera: Camera, models: EstimatorModels, P: Array, dt: float, rests: bool) -> Motion:
+    """A camera with the error's covariance P (12, 12), after `dt` [s]: ``A P Aᵀ + W Q Wᵀ`` (paper B, section 2).
+
+    One that rests keeps its pose, and its velocity is zero for certain. One that may have turned anyhow meanwhile stays
+    where it is, with an error that has nothing to do with the map.
+    """
+    if rests:
+        return camera.stopped(), _AT_REST, np.zeros_like(P)
+    anyhow = _after_gap(models, P, dt)
+    if anyhow is not None:
+        return camera.stopped(), np.zeros_like(P), camera.of_body(anyhow)
+    camera, A, W = camera.advanced(dt)
+    return camera, A, W * np.repeat(models.motion.velocity_variance(dt), 3) @ W.T
 
 
 def prior(models: EstimatorModels) -> Array:
@@ -80,19 +97,12 @@ def prior(models: EstimatorModels) -> Array:
     return np.diag(np.repeat(np.array(sigmas) ** 2, 3))
 
 
-def motion_noise(models: EstimatorModels, dt: float, W: Array | None = None) -> Array:
-    """``W Q Wᵀ`` (12, 12) of the impulses of a step of `dt` [s], with the printed W (12, 6) or another."""
-    W = np.concatenate([dt * np.eye(POSE), np.eye(POSE)]) if W is None else W
-    return np.asarray(W * np.repeat(models.motion.velocity_variance(dt), 3) @ W.T)
-
-
-def after_gap(models: EstimatorModels, P: Array, dt: float) -> Array | None:
+def _after_gap(models: EstimatorModels, P: Array, dt: float) -> Array | None:
     """Covariance (12, 12) of a camera that may have turned anyhow in the last `dt` [s]; None where it may not.
 
-    P (12, 12) is that before, of position, attitude, velocity, and rate; of the Euler angles and their rates in the
-    papers' camera. What is returned is of a turn about the body's axes and of the body's rate. The position is as
-    uncertain as the prior of the speed makes it meanwhile. Larger numbers would mean nothing, and leave a double too
-    few digits for the map.
+    P (12, 12) is that before, of position, attitude, velocity, and rate, in the camera's own numbers; what is returned
+    is about the body's axes. The position is as uncertain as the prior of the speed makes it meanwhile. Larger numbers
+    would mean nothing, and leave a double too few digits for the map.
     """
     attitude, rate = np.arange(3, 6), np.arange(9, 12)
     variance = P[attitude, attitude] + 2 * dt * P[attitude, rate] + dt * dt * P[rate, rate]

@@ -17,9 +17,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg.blas import dsyr2k, dsyrk
 
-from backends.ekf import kernels
+from backends.ekf.kernels import gather
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
 
@@ -29,184 +28,185 @@ POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Of ``[camera (12), last poses (6K), B landmarks that are parked (3B), A that are in it (3A)]``.
+    """Of ``[camera (12), last poses (6K), B landmarks that are parked (3B), A that are in the state (3A)]``, n numbers.
 
-    The state are the camera and its landmarks. The poses are perturbed on the right, the newest first. Rows of the
-    table of landmarks are in this order; behind them are those that are known from elsewhere.
+    The poses are perturbed on the right, the newest first. Rows of the table of landmarks are in this order; behind
+    them are those that are known from elsewhere.
     """
 
-    head: Array  # (12 + 6K, 12 + 6K + 3B + 3A), of camera and last poses with everything: a motion changes no more
-    marks: Array  # (3B + 3A, 3B + 3A), of landmarks
-    by_rig: Array  # derivatives (12 + 6K + 3B + 3A, m) of all errors by those of the rig
+    P: Array  # (n, n)
+    by_rig: Array  # derivatives (n, m) of all errors by those of the rig
     known: Array  # (C, 3, 3), of each landmark that is independent of all else
+    poses: int = 0  # K
     parked: int = 0  # B
 
     @classmethod
     def of_camera(cls, P: Array, by_rig: Array | None = None) -> Covariance:
         """Of the camera alone (12, 12), with derivatives (12, m) of its error by errors of the rig."""
-        return cls(P, np.zeros((0, 0)), np.zeros((CAMERA, 0)) if by_rig is None else by_rig, np.zeros((0, 3, 3)))
+        return cls(P, np.zeros((CAMERA, 0)) if by_rig is None else by_rig, np.zeros((0, 3, 3)))
+
+    @property
+    def first(self) -> int:
+        """12 + 6K: where the landmarks begin."""
+        return CAMERA + POSE * self.poses
+
+    @property
+    def begin(self) -> int:
+        """12 + 6K + 3B: where the landmarks of the state begin."""
+        return self.first + 3 * self.parked
 
     @property
     def correlated(self) -> int:
         """B + A: the landmarks after these are known from elsewhere."""
-        return len(self.marks) // 3
-
-    @property
-    def poses(self) -> int:
-        """1 + K: the present pose and those before it that are kept."""
-        return 1 + (len(self.head) - CAMERA) // POSE
+        return (len(self.P) - self.first) // 3
 
     @property
     def camera(self) -> Array:
         """Of the camera (12, 12)."""
-        return self.head[:CAMERA, :CAMERA]
+        return self.P[:CAMERA, :CAMERA]
 
     @property
     def pose(self) -> Array:
         """Of its [r, φ] (6, 6)."""
-        return self.head[:POSE, :POSE]
+        return self.P[:POSE, :POSE]
+
+    def numbers(self, rows: IndexArray) -> IndexArray:
+        """Where the coordinates (M, 3) of landmarks stand, by rows of the table."""
+        return np.asarray(self.first + 3 * rows[:, None] + np.arange(3))
 
     def marginals(self, rows: IndexArray) -> tuple[Array, Array]:
         """Covariances (M, 3, 3) of landmarks, and theirs (M, 3, 6) with the camera's [r, φ]; by rows of the table."""
         blocks, with_pose, known = np.empty((len(rows), 3, 3)), np.zeros((len(rows), 3, POSE)), rows >= self.correlated
-        each = numbers_of(rows[~known]).reshape(-1, 3)
-        blocks[~known] = self.marks[each[:, :, None], each[:, None, :]]
+        at = self.numbers(rows[~known])
+        blocks[~known], with_pose[~known] = self.P[at[:, :, None], at[:, None, :]], self.P[at, :POSE]
         blocks[known] = self.known[rows[known] - self.correlated]
-        with_pose[~known] = self.head[:POSE, len(self.head) + each].transpose(1, 2, 0)
         return blocks, with_pose
 
     def landmarks_by_rig(self, rows: IndexArray) -> Array:
         """Derivatives (M, 3, m) of some landmarks by errors of the rig."""
         out, there = np.zeros((len(rows), 3, self.by_rig.shape[1])), rows < self.correlated
-        out[there] = self.by_rig[len(self.head) + numbers_of(rows[there])].reshape(-1, *out.shape[1:])
+        out[there] = self.by_rig[self.numbers(rows[there])]
         return out
 
     def joint_poses(self, J: Array, n: int) -> Array:
         """Joint covariance (6n, 6n) of the last poses, the present one, J (6, 6) times [r, φ], last."""
-        k = CAMERA + POSE * (n - 1)
-        with_past = J @ self.head[:POSE, CAMERA:k]
-        P = np.block([[J @ self.pose @ J.T, with_past], [with_past.T, self.head[CAMERA:k, CAMERA:k]]])
-        order = np.arange(POSE * n).reshape(n, POSE)[::-1].reshape(-1)
-        P = P[order[:, None], order]
+        past = CAMERA + np.arange(POSE * (n - 1)).reshape(-1, POSE)[::-1]
+        order = np.append(past, np.arange(POSE))
+        P = self.P[order[:, None], order]
+        P[-POSE:] = J @ P[-POSE:]
+        P[:, -POSE:] = P[:, -POSE:] @ J.T
         return np.asarray(0.5 * (P + P.T))
+
+    def _arranged(self, order: IndexArray) -> Covariance:
+        """With the numbers in another order (n',), each as often as it stands there; −1 for new ones, with zeros."""
+        by_rig = gather(self.by_rig, order, np.arange(self.by_rig.shape[1]))
+        return replace(self, P=gather(self.P, order, order), by_rig=by_rig)
 
     # --- the camera moves ---
 
-    def with_pose(self, J: Array, most: int) -> Covariance:
-        """With the present pose, J (6, 6) times [r, φ], the first of the last ones; at most so many are kept."""
-        k = min(len(self.head), CAMERA + POSE * (most - 1))
-        stay = np.concatenate([np.arange(k), np.arange(len(self.head), self.head.shape[1])])
-        head, rig = self.head[:k, stay], self.by_rig[stay]
-        new = J @ head[:POSE]
-        own = np.concatenate([new[:, :CAMERA], J @ self.pose @ J.T, new[:, CAMERA:]], axis=1)
-        rows = np.concatenate([head[:, :CAMERA], new[:, :k].T, head[:, CAMERA:]], axis=1)
-        return replace(
-            self, head=np.concatenate([rows[:CAMERA], own, rows[CAMERA:]]),
-            by_rig=np.concatenate([rig[:CAMERA], J @ rig[:POSE], rig[CAMERA:]]),
-        )  # fmt: skip
+    def advanced(self, by_error: Array, most: int, J: Array, noise: Array) -> Covariance:
+        """After a motion of the camera, see `camera_moved`.
+
+        Its pose before, `by_error` (6, 6) times [r, φ], is the first of the last ones; at most so many are kept.
+        """
+        kept = min(self.poses, most - 1)
+        n, end = np.arange(len(self.P)), CAMERA + POSE * kept
+        new = self._arranged(np.concatenate([n[:CAMERA], n[:POSE], n[CAMERA:end], n[self.first :]]))
+        at = slice(CAMERA, CAMERA + POSE)
+        new.P[at], new.by_rig[at] = by_error @ new.P[at], by_error @ new.by_rig[at]
+        new.P[:, at] = new.P[:, at] @ by_error.T
+        return replace(new, poses=kept + 1)._move(J, noise)
 
     def camera_moved(self, J: Array, noise: Array) -> Covariance:
         """The camera's error (12,) becomes J times what it was, plus noise (12, 12)."""
-        head, by_rig = self.head.copy(), self.by_rig.copy()
-        head[:CAMERA], by_rig[:CAMERA] = J @ head[:CAMERA], J @ by_rig[:CAMERA]
-        own = head[:CAMERA, :CAMERA] @ J.T + noise
-        head[:CAMERA, :CAMERA] = 0.5 * (own + own.T)
-        head[CAMERA:, :CAMERA] = head[:CAMERA, CAMERA : len(head)].T
-        return replace(self, head=head, by_rig=by_rig)
+        return replace(self, P=self.P.copy(), by_rig=self.by_rig.copy())._move(J, noise)
+
+    def _move(self, J: Array, noise: Array) -> Covariance:
+        """The same, in place."""
+        P, by_rig = self.P, self.by_rig
+        P[:CAMERA], by_rig[:CAMERA] = J @ P[:CAMERA], J @ by_rig[:CAMERA]
+        own = P[:CAMERA, :CAMERA] @ J.T + noise
+        P[:CAMERA, :CAMERA] = 0.5 * (own + own.T)
+        P[CAMERA:, :CAMERA] = P[:CAMERA, CAMERA:].T
+        return self
 
     # --- landmarks join and leave ---
 
     def widened(self, rows: IndexArray, noise: Array) -> Covariance:
         """With more noise (M, 3, 3) of some landmarks, by rows of the table."""
-        marks, known, there = self.marks.copy(), self.known.copy(), rows < self.correlated
-        each = numbers_of(rows[there]).reshape(-1, 3)
-        marks[each[:, :, None], each[:, None, :]] += noise[there]
+        P, known, there = self.P.copy(), self.known.copy(), rows < self.correlated
+        at = self.numbers(rows[there])
+        P[at[:, :, None], at[:, None, :]] += noise[there]
         known[rows[~there] - self.correlated] += noise[~there]
-        return replace(self, marks=marks, known=known)
+        return replace(self, P=P, known=known)
 
     def appended(self, J: Array, noise: Array, by_rig: Array) -> Covariance:
         """With landmarks ``Y = g(r, φ) + noise`` (paper A, Eq. 10), by derivatives (M, 3, 6) and covariances (M, 3, 3).
 
         They are the last ones of the state. With the pose known, errors of the rig move them by `by_rig` (M, 3, m).
         """
-        by_pose, n, h, each = J.reshape(-1, POSE), len(self.marks), len(self.head), np.arange(len(J))
-        rows = by_pose @ self.head[:POSE]
-        own = rows[:, :POSE] @ by_pose.T
+        n, each, by_pose = len(self.P), np.arange(len(J)), J.reshape(-1, POSE)
+        new = self._arranged(np.append(np.arange(n), np.full(len(by_pose), -1)))
+        new.P[n:, :n] = by_pose @ self.P[:POSE]
+        new.P[:n, n:] = new.P[n:, :n].T
+        own = new.P[n:, :POSE] @ by_pose.T
         own.reshape(len(J), 3, len(J), 3)[each, :, each] += noise
-        marks = np.empty((n + len(rows), n + len(rows)))
-        marks[:n, :n], marks[n:, :n], marks[:n, n:] = self.marks, rows[:, h:], rows[:, h:].T
-        marks[n:, n:] = positive(0.5 * (own + own.T), own.diagonal(), POSE)
-        head = np.concatenate([self.head, rows[:, :h].T], axis=1)
-        rig = by_pose @ self.by_rig[:POSE] + by_rig.reshape(len(rows), self.by_rig.shape[1])
-        return replace(self, head=head, marks=marks, by_rig=np.concatenate([self.by_rig, rig]))
+        new.P[n:, n:] = positive(0.5 * (own + own.T), own.diagonal(), POSE)
+        new.by_rig[n:] = by_pose @ self.by_rig[:POSE] + by_rig.reshape(len(by_pose), -1)
+        return new
 
     def rearranged(self, parked: IndexArray, state: IndexArray, known: IndexArray) -> Covariance:
         """With other landmarks in each of its parts, or fewer; by their rows of the table of landmarks."""
-        h, order, first = len(self.head), np.concatenate([parked, state]), self.correlated
-        numbers = np.where(np.repeat(order, 3) < first, numbers_of(order), -1)
-        marks, new = kernels.gather(self.marks, numbers, numbers), np.flatnonzero(order >= first)
-        each = numbers_of(new).reshape(-1, 3)
-        marks[each[:, :, None], each[:, None, :]] = self.known[order[new] - first]
-        head = kernels.gather(self.head, np.arange(h), np.where(numbers < 0, -1, h + numbers))
-        by_rig = kernels.gather(self.by_rig[h:], numbers, np.arange(self.by_rig.shape[1]))
-        return Covariance(
-            np.concatenate([self.head[:, :h], head], axis=1), marks, np.concatenate([self.by_rig[:h], by_rig]),
-            self.known[known - first], len(parked),
-        )  # fmt: skip
+        rows = np.concatenate([parked, state])
+        joining = np.flatnonzero(rows >= self.correlated)
+        numbers = self.numbers(rows)
+        numbers[joining] = -1
+        new = self._arranged(np.append(np.arange(self.first), numbers))
+        at = self.numbers(joining)
+        new.P[at[:, :, None], at[:, None, :]] = self.known[rows[joining] - self.correlated]
+        return replace(new, known=self.known[known - self.correlated], parked=len(parked))
 
     # --- an update ---
 
-    def corrected(self, V: tuple[Array, Array, Array], lost_by_rig: Array, J: Array, shift: Array) -> Covariance:
+    def corrected(self, V: Array, lost_by_rig: Array, J: Array, shift: Array) -> Covariance:
         """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ = P − V Vᵀ`` (paper A, Eq. 11).
 
+        Last poses and parked landmarks keep the covariance that they have among themselves.
+
         Args:
-            V: ``P Hᵀ L⁻ᵀ`` of camera and last poses, of what is parked, of the state's landmarks, in Fortran's order.
+            V: ``P Hᵀ L⁻ᵀ`` (n, 3M), with ``S = L Lᵀ``.
             lost_by_rig: L⁻¹ times derivatives (3M, m) of the innovation by errors of the rig.
             J: the camera's error becomes J (12, 12) times what it was,
-            shift: and then to those of the landmarks this (A, 3, 6) times that of the pose is added.
+            shift: and then to those of the state's landmarks this (A, 3, 6) times that of the pose is added.
         """
-        V_head, V_parked, V_marks = V
-        h, b, terms = len(self.head), 3 * self.parked, len(V_marks.T)
-        head, by_rig, shift = self.head.copy(), self.by_rig.copy(), np.asfortranarray(shift.reshape(-1, POSE))
-        head[:CAMERA, :h] -= V_head[:CAMERA] @ V_head.T
-        head[:CAMERA, h : h + b] -= V_head[:CAMERA] @ V_parked.T
-        head[:, h + b :] -= V_head @ V_marks.T
-        by_rig[:CAMERA] -= V_head[:CAMERA] @ lost_by_rig
-        head[:CAMERA], by_rig[:CAMERA] = J @ head[:CAMERA], J @ by_rig[:CAMERA]
-        moved = head[:CAMERA, :CAMERA] @ J.T
-        own = positive(0.5 * (moved + moved.T), self.camera.diagonal(), terms)
-        head[:CAMERA, :CAMERA], head[CAMERA:, :CAMERA] = own, head[:CAMERA, CAMERA:h].T
-        marks = self.marks[b:, b:]
-        if len(marks):
-            marks = dsyrk(-1.0, V_marks, beta=1.0, c=marks.T, lower=1)  # a copy, of which the lower triangle counts
-            half = head[:POSE, h + b :].T + 0.5 * shift @ own[:POSE, :POSE]
-            marks = dsyr2k(1.0, shift, half, beta=1.0, c=marks, lower=1, overwrite_c=1).T
-            kernels.mirror(marks)
-            summands = self.marks.diagonal()[b:] + ((shift @ own[:POSE, :POSE]) * shift).sum(axis=1)
-            positive(marks, summands, terms)
-        if b:
-            state, marks = marks, self.marks.copy()
-            cross = self.marks[b:, :b] - V_marks @ V_parked.T + shift @ head[:POSE, h : h + b]
-            marks[b:, b:], marks[b:, :b], marks[:b, b:] = state, cross, cross.T
-        by_rig[h + b :] += shift @ by_rig[:POSE] - V_marks @ lost_by_rig
-        head[:, h + b :] += head[:, :POSE] @ shift.T
-        return replace(self, head=head, marks=marks, by_rig=by_rig)
+        P, by_rig, b, shift = self.P.copy(), self.by_rig.copy(), self.begin, shift.reshape(-1, POSE)
+        P[:CAMERA] -= V[:CAMERA] @ V.T
+        P[CAMERA:b, b:] -= V[CAMERA:b] @ V[b:].T
+        by_rig[:CAMERA], by_rig[b:] = by_rig[:CAMERA] - V[:CAMERA] @ lost_by_rig, by_rig[b:] - V[b:] @ lost_by_rig
+        P[:CAMERA], by_rig[:CAMERA] = J @ P[:CAMERA], J @ by_rig[:CAMERA]
+        moved = P[:CAMERA, :CAMERA] @ J.T
+        own = positive(0.5 * (moved + moved.T), self.camera.diagonal(), V.shape[1])
+        gone, across = V[b:] @ V[b:].T, (P[:POSE, b:].T + 0.5 * shift @ own[:POSE, :POSE]) @ shift.T
+        gone -= across
+        gone -= across.T
+        P[b:, b:] -= gone
+        summands = self.P.diagonal()[b:] + ((shift @ own[:POSE, :POSE]) * shift).sum(axis=1)
+        positive(P[b:, b:], summands, V.shape[1])
+        P[:CAMERA, :CAMERA] = own
+        P[CAMERA:b, :CAMERA] = P[:CAMERA, CAMERA:b].T
+        P[:b, b:] += P[:b, :POSE] @ shift.T
+        P[b:, :b], by_rig[b:] = P[:b, b:].T, by_rig[b:] + shift @ by_rig[:POSE]
+        return replace(self, P=P, by_rig=by_rig)
 
     def displaced(self, rows: IndexArray, change: Array, shift: Array) -> Covariance:
         """After a change (M, 3) of some landmarks' coordinates that is none of their error, with a shift as above.
 
         It is that of the last of the rig's errors, which is known to be 1 (`slam.interfaces.ConsideringBackend`).
         """
-        by_rig, h, b = self.by_rig.copy(), len(self.head), 3 * self.parked
-        by_rig[h + numbers_of(rows), -1:] -= change.reshape(-1, 1)
-        V = np.zeros((h, 1)), np.zeros((b, 1)), np.zeros((len(self.marks) - b, 1), order="F")
-        nothing = np.zeros((1, by_rig.shape[1]))
-        return replace(self, by_rig=by_rig).corrected(V, nothing, np.eye(CAMERA), shift)
-
-
-def numbers_of(rows: IndexArray) -> IndexArray:
-    """Of landmarks' coordinates (3M,) among those of all."""
-    return np.asarray((3 * rows[:, None] + np.arange(3)).reshape(-1))
+        by_rig = self.by_rig.copy()
+        by_rig[self.numbers(rows).ravel(), -1:] -= change.reshape(-1, 1)
+        nothing = np.zeros((len(self.P), 0)), np.zeros((0, by_rig.shape[1]))
+        return replace(self, by_rig=by_rig).corrected(*nothing, np.eye(CAMERA), shift)
 
 
 def positive(P: Array, summands: Array, terms: int) -> Array:

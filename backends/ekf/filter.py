@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from backends.ekf.camera import Camera, Motion, motion_noise
+from backends.ekf.camera import Camera, moved
 from backends.ekf.covariance import CAMERA, POSE, Covariance, positive
 from backends.ekf.innovation import UnsolvableError, Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
@@ -23,7 +23,6 @@ from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
 from slam.window.consensus import landmarks_pose
-from slam.window.gating import INFLATION
 from slam.window.stereo import TOO_LATE, Field, RectifiedMeasurement
 
 #: Standard deviations of a known point between it and its anchor: its coordinates are linear there, it stays Gaussian.
@@ -68,12 +67,12 @@ class LandmarkFilter:
     @one_blas_thread
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
-        return self._predicted(stamp, lambda camera, dt: camera.advanced(self.models, self.state.covariance.camera, dt))
+        return self._predicted(stamp, rests=False)
 
     @one_blas_thread
     def predict_at_rest(self, stamp: float) -> Prediction:
         """See `slam.interfaces.RestingBackend.predict_at_rest`."""
-        return self._predicted(stamp, lambda camera, dt: camera.at_rest())
+        return self._predicted(stamp, rests=True)
 
     @one_blas_thread
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
@@ -126,7 +125,7 @@ class LandmarkFilter:
 
         Raises MeasurementError before the first `predict`, or where n is less than one.
         """
-        s, n = self._started("recent"), min(require_recent(self.name, n), self.state.covariance.poses)
+        s, n = self._started("recent"), min(require_recent(self.name, n), 1 + self.state.covariance.poses)
         return RecentPoses(*self._path(n), s.covariance.joint_poses(s.camera.by_error(), n))
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
@@ -201,14 +200,15 @@ class LandmarkFilter:
         path = [*before, (s.stamp, s.pose)] if s.frame >= 0 else []
         return np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4)
 
-    def _predicted(self, stamp: float, moved: Callable[[Camera, float], Motion]) -> Prediction:
-        """Go to a time; `moved` says what the camera does meanwhile. What is in the angle of view then."""
+    def _predicted(self, stamp: float, rests: bool) -> Prediction:
+        """Go to a time, and say what is in the angle of view then; whether the camera rests meanwhile."""
         s = self.state
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
         if s.frame < 0:
             after = replace(s, stamp=float(stamp), frame=0, closed=False)
         else:
-            after = s.advanced(float(stamp), moved(s.camera, stamp - s.stamp))
+            motion = moved(s.camera, self.models, s.covariance.camera, stamp - s.stamp, rests)
+            after = s.advanced(float(stamp), motion)
         T, rows = after.pose, self._measure.visible(after.pose, after.landmarks.points)
         after = after.slid(self._coordinates, rows, self.models.slide.density / self._measure.stereo.f)
         marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
@@ -236,14 +236,13 @@ class LandmarkFilter:
             self._iterations,
         )  # fmt: skip
         update = update if guess is None else update.facing(guess)
-        noises = (factor**2 * motion_noise(self.models, s.dt) for factor in INFLATION if s.frame > 0)
 
         def search() -> Array | None:
             T, measure = s.pose if guess is None else guess, RectifiedMeasurement(self.rig, self.models)
             return landmarks_pose(measure, update.landmarks.points, z, T, s.frame + 1)
 
         try:
-            found = agreement(update, noises, search)
+            found = agreement(update, search)
             if found is None:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids.copy())

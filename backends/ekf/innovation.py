@@ -2,14 +2,12 @@
 
 A landmark's measurement depends on where it is as seen from the camera alone. An error x of the camera's pose moves it
 there by ``−lever x`` in its own coordinates, so that ``H = own [−lever, 1]`` has columns for the pose and the
-landmark: a displacement of both together is no row's business, wherever H is taken. A component that is not measured,
-or gated, keeps its row with a zero Jacobian and a zero innovation: it adds nothing.
+landmark: a displacement of both together is no row's business, wherever H is taken. A component that is not measured
+keeps its row with a zero Jacobian and a zero innovation: it adds nothing.
 """
 
 from __future__ import annotations
 
-import math
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,7 +16,7 @@ from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from backends.ekf.camera import Camera
-from backends.ekf.covariance import CAMERA, POSE, Covariance, numbers_of
+from backends.ekf.covariance import CAMERA, POSE, Covariance
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
@@ -43,7 +41,7 @@ class Update:
     measure: RectifiedMeasurement  # what they measure, their noise, and the gate
     coordinates: Coordinates
     iterations: int  # most linearisations
-    guess: Array | None = None  # a pose (4, 4) worth trying where the prior is far off
+    guess: Array | None = None  # a pose (4, 4) to linearise at where it is not linear from the prior on
 
     @property
     def sigma(self) -> float:
@@ -62,8 +60,13 @@ class Update:
 
     @cached_property
     def numbers(self) -> IndexArray:
-        """Where the coordinates (3M,) of the measured landmarks stand among those of the state's."""
-        return numbers_of(self.rows - self.covariance.parked)
+        """Where the coordinates (3M,) of the measured landmarks stand in the covariance."""
+        return self.covariance.numbers(self.rows).ravel()
+
+    @cached_property
+    def measured(self) -> IndexArray:
+        """And in a change of the state (12 + 3A,), camera and landmarks, with the pose before them (6 + 3M,)."""
+        return np.append(np.arange(POSE), self.numbers - self.covariance.begin + CAMERA)
 
     @cached_property
     def lever(self) -> Array:
@@ -77,44 +80,32 @@ class Update:
         A displacement N is an error of the pose with the landmarks along by the lever. What is left of an error is to
         be independent of that part: ``A = (Nᵀ P⁻¹ N)⁻¹ Nᵀ P⁻¹``. None where P has lost its digits.
         """
-        P, h, each = self.covariance, len(self.covariance.head), 3 * self.covariance.parked + self.numbers
-        across = P.head[:POSE, h + each]
-        joint = np.block([[P.pose, across], [across.T, P.marks[each[:, None], each]]])
-        N, (root, info) = np.concatenate([np.eye(POSE), self.lever.reshape(-1, POSE)]), dpotrf(joint, lower=1)
+        numbers = np.append(np.arange(POSE), self.numbers)
+        root, info = dpotrf(self.covariance.P[numbers[:, None], numbers], lower=1)
+        N = np.concatenate([np.eye(POSE), self.lever.reshape(-1, POSE)])
         Z = dpotrs(root, N, lower=1)[0] if info == 0 else np.full(N.shape, np.nan)
         return np.linalg.solve(N.T @ Z, Z.T) if np.isfinite(Z).all() else None
 
-    def among_measured(self, change: Array) -> Array:
-        """The part (6 + 3M,) of a change of the state (n,) that the measurements depend on."""
-        return np.concatenate([change[:POSE], change[CAMERA + self.numbers]])
-
-    def at(self, camera: Camera | None = None, moved: Array | None = None, from_prior: float = 0.0) -> Linearisation:
-        """Linearised at a camera, by default the prior's, and a change (3A,) of the state's landmarks, by default none.
+    def at(self, camera: Camera | None = None, moved: Array | None = None) -> Linearisation:
+        """Linearised at a camera and a change (3A,) of the state's landmarks, by default those of the prior.
 
         A landmark is at ``h = Rᵀ (Y − r)`` (paper B, Eqs. 3-5).
         """
         there, marks = camera or self.camera, self.landmarks
         J = np.eye(CAMERA) if camera is None else self.camera.transport(camera)
-        change = np.zeros(CAMERA + len(self.covariance.marks) - 3 * self.covariance.parked)
+        change = np.zeros(CAMERA + len(self.covariance.P) - self.covariance.begin)
         if camera is not None:
             change[:CAMERA] = np.linalg.solve(J, there.minus(self.camera))
         if moved is not None:
-            marks = marks.moved(self.coordinates, slice(None), moved[self.numbers].reshape(-1, 3))
             change[CAMERA:] = moved
-            change[CAMERA + self.numbers] = (marks.c - self.landmarks.c).reshape(-1)  # a coordinate may be at its limit
+            asked = change[self.measured[POSE:]].reshape(-1, 3)
+            marks = marks.moved(self.coordinates, slice(None), asked)
+            change[self.measured[POSE:]] = (marks.c - self.landmarks.c).reshape(-1)  # a coordinate may be at its limit
         R, r = there.pose[:3, :3], there.pose[:3, 3]
         z, by_point = self.measure.stereo.project((marks.points - r) @ R)
         own = by_point @ (R.T @ self.coordinates.jacobian(marks.anchors, marks.c))
         lever = self.lever if camera is None is moved else marks.gauge @ (there.world() @ J[:POSE, :POSE])
-        return Linearisation(self, there, J, change, z, own, lever, from_prior)
-
-    def at_guess(self) -> Linearisation:
-        """The guess, with the landmarks where they are believed: its distance from the prior is that of the pose."""
-        assert self.guess is not None
-        there, distance = self.at(self.camera.at(self.guess)), math.inf
-        with suppress(np.linalg.LinAlgError):  # a pose that is known exactly cannot be moved
-            distance = float(there.change[:POSE] @ np.linalg.solve(self.covariance.pose, there.change[:POSE]))
-        return replace(there, from_prior=distance)
+        return Linearisation(self, there, J, change, z, own, lever)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,13 +119,6 @@ class Linearisation:
     z: Array  # what is predicted here (M, 3) [px], NaN behind a camera
     own: Array  # its derivatives (M, 3, 3) by the coordinates
     lever: Array  # (M, 3, 6), see the module
-    from_prior: float  # squared distance from the prior
-
-    def cost(self, components: BoolArray) -> float:
-        """Squared distance from the prior and some components (M, 3) of the measurements; ∞ where one is not seen."""
-        residual = np.where(components, self.update.z - self.z, 0.0)
-        cost = self.from_prior + float(np.vdot(residual, residual)) / self.update.sigma**2
-        return cost if math.isfinite(cost) else math.inf
 
     def camera_after(self, change: Array) -> Camera:
         """The camera after a change of the state (n,) from the prior."""
@@ -144,27 +128,29 @@ class Linearisation:
         """Components (M, 3) that are measured, of landmarks before both cameras."""
         return np.asarray(np.isfinite(self.update.z) & np.isfinite(self.z).all(axis=1, keepdims=True))
 
-    def innovation(self, components: BoolArray) -> Innovation:
-        """ν and S of some components (M, 3).
+    def innovation(self) -> Innovation:
+        """ν and S of what is measured.
 
         If the camera transports its error, the prior has a displacement of the world as N, its derivative at the prior.
         Elsewhere that is not quite one: ``H N = B`` is not zero, and the update would measure it. H is therefore taken
         of what else there is of an error, ``H − B A`` with A N = 1; or, where there is no A, with the prior's lever.
         """
-        update, P = self.update, self.update.covariance
-        numbers, b, h = 3 * P.parked + update.numbers, 3 * P.parked, len(P.head)
-        own = self.own if components.all() else np.where(components[:, :, None], self.own, 0.0)
+        update, P = self.update, self.update.covariance.P
+        seen = self.seen()
+        own = np.where(seen[:, :, None], self.own, 0.0)
         B, A, lever = (own @ (update.lever - self.lever)).reshape(-1, POSE), None, self.lever
         if update.camera.transports and B.any():
             A, lever = update.place, self.lever if update.place is not None else update.lever
         H = Jacobian(own, -(own @ lever).reshape(-1, POSE), B, A)
-        nu = np.where(components, update.z - self.z, 0.0).reshape(-1)
-        nu += H.times(self.change[:POSE, None], self.change[CAMERA + update.numbers, None])[:, 0]
-        with_camera = H.times(P.camera[:POSE], P.head[:CAMERA, h + numbers].T)
-        with_marks = H.times(P.head[:POSE, h + b :], P.marks[:, b:][numbers])
-        S = H.times(with_camera[:, :POSE].T, with_marks[:, update.numbers].T)
+        nu = np.where(seen, update.z - self.z, 0.0).reshape(-1) + H.times(self.change[update.measured, None])[:, 0]
+        numbers = np.append(np.arange(POSE), update.numbers)
+        HP = H.times(P[numbers])
+        S = H.times(HP[:, numbers].T)
         S[np.diag_indices(len(S))] += update.sigma**2
-        return Innovation(self, components, H, (with_camera, with_marks), nu, S)
+        upper, info = dpotrf(S.T)  # of the transpose, which is in the order that LAPACK wants
+        if info != 0:
+            raise UnsolvableError("the innovation covariance is not positive definite")
+        return Innovation(self, seen, H, HP, nu, S, upper_inverse(upper).T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,12 +162,12 @@ class Jacobian:
     B: Array  # (3M, 6), see `Linearisation.innovation`
     A: Array | None  # (6, 6 + 3M)
 
-    def times(self, of_pose: Array, of_marks: Array) -> Array:
-        """H (3M, ·) of a matrix with the rows (6, k) of the pose and (3M, k) of the measured landmarks."""
-        out = self.by_pose @ of_pose
-        out += (self.own @ of_marks.reshape(len(self.own), 3, -1)).reshape(out.shape)
+    def times(self, X: Array) -> Array:
+        """H (3M, ·) of a matrix X (6 + 3M, ·)."""
+        out = self.by_pose @ X[:POSE]
+        out += (self.own @ X[POSE:].reshape(len(self.own), 3, -1)).reshape(out.shape)
         if self.A is not None:
-            out -= self.B @ (self.A[:, :POSE] @ of_pose + self.A[:, POSE:] @ of_marks)
+            out -= self.B @ (self.A @ X)
         return np.asarray(out)
 
 
@@ -190,61 +176,59 @@ class Innovation:
     """ν and its covariance S (paper A, Eq. 11)."""
 
     at: Linearisation
-    components: BoolArray  # which of the measurements' (M, 3)
+    seen: BoolArray  # components (M, 3) that are measured
     H: Jacobian
-    HP: tuple[Array, Array]  # H P: with the camera (3M, 12), and with the landmarks of the state (3M, 3A)
+    HP: Array  # H P (3M, n), with everything
     nu: Array  # innovation of the prior's mean (3M,)
     S: Array  # its covariance (3M, 3M)
+    inverse: Array  # L⁻¹ (3M, 3M), lower triangular, with ``S = L Lᵀ``
 
     def whitened(self, used: BoolArray) -> Whitened:
-        """That of some landmarks (mask (M,)), whitened; UnsolvableError where S is not positive definite."""
-        nu, S, out = self.nu, self.S, np.flatnonzero(np.repeat(~used, 3))
-        if len(out):
-            nu, S = nu.copy(), S.copy()
-            nu[out], S[out], S[:, out], S[out, out] = 0.0, 0.0, 0.0, 1.0
-        upper, info = dpotrf(S.T)  # of the transpose, which is in the order that LAPACK wants
-        if info != 0:
-            raise UnsolvableError("the innovation covariance is not positive definite")
-        inverse = upper_inverse(upper).T
-        inverse[out, out] = 0.0
-        return Whitened(self, used, nu, inverse)
+        """That of some landmarks (mask (M,)), whitened.
+
+        Of ``L⁻¹ ν`` that part is taken which does not depend on the others' measurements: with A (3M, k) orthonormal,
+        spanned by their columns of L⁻¹, it is ``(1 − A Aᵀ) L⁻¹ ν``, whose square is the ``νᵀ S⁻¹ ν`` of these alone.
+        """
+        out = np.flatnonzero(np.repeat(~used, 3))
+        A = np.linalg.qr(self.inverse[:, out])[0]
+        root = self.inverse - A @ (A.T @ self.inverse) if len(out) else self.inverse.copy()
+        root[:, out] = 0.0
+        return Whitened(self, used, A, root)
 
 
 @dataclass(frozen=True, eq=False)
 class Whitened:
-    """The innovation of some landmarks whitened by ``S = L Lᵀ``: ``w = L⁻¹ ν`` has covariance 1."""
+    """The innovation of some landmarks whitened: ``w = root ν`` has the covariance ``1 − A Aᵀ``, see above."""
 
     innovation: Innovation
     used: BoolArray  # which landmarks (M,)
-    nu: Array  # (3M,), zero for the others
-    inverse: Array  # L⁻¹ (3M, 3M), lower triangular, with zero rows for the others
+    A: Array  # (3M, k)
+    root: Array  # (3M, 3M), with zero columns for the others; its square is their S⁻¹
 
     @cached_property
     def w(self) -> Array:
         """The whitened innovation (3M,); its square is the NIS ``νᵀ S⁻¹ ν``."""
-        return np.asarray(self.inverse @ self.nu)
+        return np.asarray(self.root @ self.innovation.nu)
 
     @cached_property
     def y(self) -> Array:
         """``S⁻¹ ν`` (3M,)."""
-        return np.asarray(self.w @ self.inverse)
+        return np.asarray(self.w @ self.root)
 
     @cached_property
     def by_pose(self) -> Array:
         """The whitened innovation's covariance (3M, 6) with the pose."""
-        return np.asarray(self.inverse @ self.innovation.HP[0][:, :POSE])
+        return np.asarray(self.root @ self.innovation.HP[:, :POSE])
 
-    def gain_root(self) -> tuple[tuple[Array, Array, Array], Array]:
-        """``P Hᵀ L⁻ᵀ``, and L⁻¹ times derivatives of ν by errors of the rig; see `Covariance.corrected`."""
-        nu, (with_camera, with_marks), update = self.innovation, self.innovation.HP, self.innovation.at.update
-        P = update.covariance
-        h, b, numbers = len(P.head), 3 * P.parked, 3 * P.parked + update.numbers
-        poses_and_left = np.concatenate([P.head[CAMERA:, h + numbers].T, P.marks[:, :b][numbers]], axis=1)
-        rest = nu.H.times(P.head[:POSE, CAMERA : h + b], poses_and_left)
-        V = dtrmm(1.0, self.inverse.T, np.concatenate([with_camera, rest], axis=1).T, side=1)
-        by_rig = nu.H.times(P.by_rig[:POSE], P.by_rig[h + numbers])
-        by_rig -= np.where(nu.components[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
-        return (V[:h], V[h:], dtrmm(1.0, self.inverse.T, with_marks.T, side=1)), self.inverse @ by_rig
+    def gain_root(self) -> tuple[Array, Array]:
+        """V (n, 3M) with ``V Vᵀ = K S Kᵀ``, and ``root`` times derivatives of ν by errors of the rig."""
+        nu, update = self.innovation, self.innovation.at.update
+        V = dtrmm(1.0, nu.inverse.T, nu.HP.T, side=1)
+        if self.A.size:
+            V -= (V @ self.A) @ self.A.T
+        by_rig = nu.H.times(update.covariance.by_rig[np.append(np.arange(POSE), update.numbers)])
+        by_rig -= np.where(nu.seen[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
+        return V, self.root @ by_rig
 
     def distances(self) -> Array:
         """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any.
@@ -252,7 +236,7 @@ class Whitened:
         For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off
         by ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so that the distance is ``y_jᵀ Q_j⁻¹ y_j``.
         """
-        columns = np.ascontiguousarray(self.inverse.reshape(-1, len(self.used), 3).transpose(1, 2, 0)[self.used])
+        columns = np.ascontiguousarray(self.root.reshape(-1, len(self.used), 3).transpose(1, 2, 0)[self.used])
         found = np.zeros(len(self.used))
         found[self.used] = squared_distances(self.y.reshape(-1, 3)[self.used], columns @ columns.transpose(0, 2, 1))
         if not np.isfinite(found).all():

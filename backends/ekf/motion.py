@@ -22,7 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
-from backends.ekf.camera import AT_REST, Motion, after_gap, motion_noise, prior
+from backends.ekf.camera import prior
 from backends.ekf.covariance import CAMERA, POSE
 from slam.geometry import se3
 from slam.geometry.se3 import Array, angles, body_rate_matrix, hat, rotation
@@ -54,7 +54,7 @@ class EulerCamera:
         phi = angles(CANONICAL)
         x = np.concatenate([models.initial_pose[:3, 3], phi, np.zeros(6)])
         camera = cls(x, models.initial_pose[:3, :3] @ CANONICAL.T, consistent)
-        return camera, _of_angles(prior(models), phi)
+        return camera, camera.of_body(prior(models))
 
     @cached_property
     def pose(self) -> Array:
@@ -101,14 +101,11 @@ class EulerCamera:
             J[6:9, 3:6] = -hat(change[6:9]) @ A_before
         return J
 
-    def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion:
-        """See `Camera`: ``A P Aᵀ + W Q Wᵀ`` (paper B, section 2), in pieces through the angles' singularity.
+    def advanced(self, dt: float) -> tuple[EulerCamera, Array, Array]:
+        """See `Camera`: the printed A and W, in pieces through the angles' singularity.
 
-        Q is of impulses at the beginning: they change the velocities, after the first new world, and A carries them on.
+        Impulses at the beginning change the velocities, after the first new world, and A carries them on.
         """
-        gap = after_gap(models, P, dt)
-        if gap is not None:  # it may be turned anyhow: it stays, independent of the map
-            return self._stopped(), np.zeros((CAMERA, CAMERA)), _of_angles(gap, self.x[3:6])
         turn = np.linalg.norm(body_rate_matrix(self.x[3:6]) @ self.x[9:]) * dt  # φy turns by no more
         pieces = math.ceil(np.clip(turn / LIMIT, 1, _PIECES))
         camera, J, W = self, np.eye(CAMERA), np.eye(CAMERA)[:, POSE:]
@@ -120,7 +117,7 @@ class EulerCamera:
                 W = G @ W if piece else W
             camera, A = camera._transition(dt / pieces)
             J, W = A @ J, A @ W
-        return camera, J, motion_noise(models, dt, W)
+        return camera, J, W
 
     def _transition(self, dt: float) -> tuple[EulerCamera, Array]:
         """``x ← f(x)`` with the printed A.
@@ -138,12 +135,15 @@ class EulerCamera:
             A = A @ J
         return replace(self, x=x), A
 
-    def at_rest(self) -> Motion:
+    def stopped(self) -> EulerCamera:
         """See `Camera`."""
-        return self._stopped(), AT_REST, np.zeros((CAMERA, CAMERA))
-
-    def _stopped(self) -> EulerCamera:
         return replace(self, x=np.concatenate([self.x[:POSE], np.zeros(POSE)]))
+
+    def of_body(self, P: Array) -> Array:
+        """See `Camera`: of the angles φ and their rates."""
+        E = np.eye(CAMERA)
+        E[3:6, 3:6] = E[9:12, 9:12] = np.linalg.inv(body_rate_matrix(self.x[3:6]))
+        return np.asarray(E @ P @ E.T)
 
     def facing(self, T: Array) -> tuple[EulerCamera, Array]:
         """See `Camera`."""
@@ -187,10 +187,3 @@ def body_rate_derivative(phi: Array, omega: Array) -> Array:
 def turning(R_world_angles: Array, x: Array) -> Array:
     """Derivative (3, 3) of the attitude, turned about the world's axes, by the angles φ of a camera (12,)."""
     return np.asarray(R_world_angles @ rotation(x[3:6]) @ body_rate_matrix(x[3:6]))
-
-
-def _of_angles(P: Array, phi: Array) -> Array:
-    """A covariance (12, 12) whose turns are isotropic about the body's axes, of the angles φ (3,) and their rates."""
-    E = np.eye(CAMERA)
-    E[3:6, 3:6] = E[9:12, 9:12] = np.linalg.inv(body_rate_matrix(phi))
-    return np.asarray(E @ P @ E.T)

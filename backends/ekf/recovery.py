@@ -1,19 +1,16 @@
 """What the filter tries where most observations contradict its prediction.
 
-Then the prediction is wrong, not the observations. There are three cases, tried in turn:
+Then the prediction is wrong, not the observations. There are two cases, tried in turn:
 
 - It is so far off that its linearisation does not hold: the update is linearised where the matches agree on a pose.
-- An impulse was larger than the motion model expects, or the camera turned as the Euler model cannot follow: the
-  process noise is inflated.
-- The filter is lost, after a long gap or a stretch with hardly anything to see: the landmarks agree on a pose that no
-  impulse explains. The camera restarts there, in the same map.
+- The filter is lost, by an impulse that the motion model does not expect, a long gap, or a stretch with hardly anything
+  to see: the landmarks agree on a pose that the prediction excludes. The camera restarts there, in the same map.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
@@ -28,23 +25,22 @@ from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, b
 Search = Callable[[], "Array | None"]
 
 
-def agreement(update: Update, noises: Iterable[Array], search: Search) -> Posterior | None:
-    """Solve with the prior that most observations agree with; None where there is none.
+def agreement(update: Update, search: Search) -> Posterior | None:
+    """Solve with the prior, or where it fails the pose, that most observations agree with; None where there is none.
 
     Where less than a third of the observations agrees, and as many wrong ones might agree by chance, that agreement is
-    ignored: it could move the pose anywhere. `noises` are motion noises (12, 12) that may have been there in addition,
-    smallest first; `search` is only called where nothing else helps. Raises UnsolvableError where the reason is
-    numerical.
+    ignored: it could move the pose anywhere. `search` is only called where nothing else helps. Raises UnsolvableError
+    where the reason is numerical.
     """
-    P = update.covariance
-    if not (np.isfinite(update.camera.pose).all() and math.isfinite(P.camera.trace() + P.marks.trace())):
+    if not (np.isfinite(update.camera.pose).all() and math.isfinite(update.covariance.P.trace())):
         raise UnsolvableError("the predicted state is not finite")
     found, error, majority = None, None, (len(update.z) + 1) // 2
-    for prior, at_guess, least in _tries(update, noises):
+    least = max(MIN_OBSERVATIONS, majority)  # what passes the gate; in the end `solve` takes out what disagrees
+    for T, passing in [(None, least), (update.guess, least), (None, 0)][:: 2 if update.guess is None else 1]:
         try:
-            gated = gate(prior, at_guess)
-            agreed = _agreed(gated) if gated.used.sum() >= least else None
-        except UnsolvableError as reason:  # another prior may do
+            gated = gate(update, T)
+            agreed = _agreed(gated) if gated.used.sum() >= passing else None
+        except UnsolvableError as reason:  # another start may do
             error = reason
             continue
         found = agreed or found
@@ -54,20 +50,6 @@ def agreement(update: Update, noises: Iterable[Array], search: Search) -> Poster
     if found is None and error is not None:
         raise error
     return found
-
-
-def _tries(update: Update, noises: Iterable[Array]) -> Iterable[tuple[Update, bool, int]]:
-    """Priors, whether each is seen from the guess, and how many observations shall pass its gate.
-
-    The usual one; with more noise, or from the guess; the usual one again, of which `solve` takes out what disagrees.
-    """
-    majority = max(MIN_OBSERVATIONS, (len(update.z) + 1) // 2)
-    if len(update.z) >= majority:
-        for prior in itertools.chain([update], map(update.wider, noises)):
-            yield prior, False, majority
-            if update.guess is not None:
-                yield prior, True, majority
-    yield update, False, 0
 
 
 def _restarted(update: Update, search: Search, least: int) -> Posterior | None:
@@ -80,7 +62,7 @@ def _restarted(update: Update, search: Search, least: int) -> Posterior | None:
     sigmas = far, turned, models.initial_velocity_sigma, models.initial_angular_velocity_sigma
     there = update.facing(T).wider(np.diag(np.repeat(np.array(sigmas, float) ** 2, 3)))
     with suppress(UnsolvableError):
-        found = solve(gate(there, at_guess=True))
+        found = solve(gate(there, T))
         return found if found is not None and found.used.sum() >= least else None
     return None
 

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf
 
 from backends.ekf.camera import Camera
-from backends.ekf.covariance import CAMERA, POSE, numbers_of
-from backends.ekf.innovation import Innovation, Linearisation, UnsolvableError, Update, Whitened
+from backends.ekf.covariance import CAMERA, POSE
+from backends.ekf.innovation import Innovation, UnsolvableError, Update, Whitened
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray
 from slam.geometry.se3 import Array
@@ -26,7 +26,6 @@ from slam.window.gating import squared_distances
 _LINEAR = 1.0
 #: Their errors together may move the pose by this share of its deviations: with a wide prior all have the same sign.
 _POSE_SHARE = 0.25
-_HALVINGS = 6  # numerics: of a step that does not lower the cost
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,14 +56,14 @@ class Gated:
     innovation: Innovation
 
 
-def gate(update: Update, at_guess: bool = False) -> Gated:
-    """Test each landmark by itself, with its innovation linearised at the prior or at the guess.
+def gate(update: Update, T: Array | None = None) -> Gated:
+    """Test each landmark by itself, with its innovation linearised at the prior, or with the camera at a pose T (4, 4).
 
     Raises UnsolvableError where S is not positive definite.
     """
-    start = update.at_guess() if at_guess else update.at()
-    measured, innovation = np.isfinite(update.z), start.innovation(start.seen())
-    limits = chi_square_limits(measured.sum(axis=1), update.measure.models.gate_probability)
+    start = update.at(None if T is None else update.camera.at(T))
+    innovation = start.innovation()
+    limits = chi_square_limits(np.isfinite(update.z).sum(axis=1), update.measure.models.gate_probability)
     own = squared_distances(innovation.nu.reshape(-1, 3), _blocks(innovation.S))
     if not np.isfinite(own).all():
         raise UnsolvableError("the predicted innovations are not finite or not positive definite")
@@ -82,7 +81,7 @@ def solve(gated: Gated) -> Posterior | None:
     if found is not None:
         faced = update.facing(found.camera.pose)
         if faced.camera is not update.camera:  # the coordinates of its error are nearly singular there
-            found, update = _twice(gate(faced, at_guess=True)), faced
+            found, update = _twice(gate(faced, faced.guess)), faced
     if found is not None:
         root = found.whitened.by_pose
         if dpotrf(update.covariance.pose - root.T @ root, lower=1)[1] != 0:
@@ -106,11 +105,12 @@ def _agreeing(gated: Gated, used: BoolArray) -> Posterior | None:
     the worst one, until all that is left agrees; None where nothing is left.
     """
     while used.any():
-        found = _iterate(gated.innovation.whitened(used))
+        found = _iterate(gated.innovation, used)
+        used = found.used
         excess = found.whitened.distances() / gated.limits
         worst = excess.max()
         if worst <= 1:
-            return found
+            return found if used.any() else None
         used = used & (excess <= max(1.0, 0.5 * worst))
     return None
 
@@ -118,19 +118,17 @@ def _agreeing(gated: Gated, used: BoolArray) -> Posterior | None:
 def _predicted(found: Posterior, gated: Gated) -> BoolArray:
     """Which landmarks (mask (M,)) that a solution does not use lie within the gate of what it predicts of them.
 
-    The gate tested them at the prior. With X = L⁻¹ S of the used with such a landmark, its innovation given the used
-    ones is ``ν − Xᵀ w``, and its covariance ``S − Xᵀ X``.
+    The gate tested them at the prior. With X the covariance of w with such a landmark's innovation ν, that given the
+    used ones is ``ν − Xᵀ w``, and its covariance ``S − Xᵀ X``.
     """
-    at, agree = found.whitened.innovation.at, np.zeros(len(found.used), bool)
-    seen = at.seen()
-    out = np.flatnonzero(~found.used & seen.any(axis=1) & np.isfinite(gated.distances))
+    nu, agree = found.whitened.innovation, np.zeros(len(found.used), bool)
+    out = np.flatnonzero(~found.used & nu.seen.any(axis=1) & np.isfinite(gated.distances))
     if len(out):
-        every = gated.innovation if at is gated.innovation.at else at.innovation(seen)
-        numbers = numbers_of(out)
-        X = found.whitened.inverse @ every.S[:, numbers]
-        nu = (every.nu[numbers] - found.whitened.w @ X).reshape(-1, 3)
-        S = every.S[numbers[:, None], numbers] - X.T @ X
-        agree[out] = squared_distances(nu, _blocks(S)) <= gated.limits[out]
+        numbers = (3 * out[:, None] + np.arange(3)).ravel()
+        X = found.whitened.root @ nu.S[:, numbers]
+        S = nu.S[numbers[:, None], numbers] - X.T @ X
+        residuals = (nu.nu[numbers] - found.whitened.w @ X).reshape(-1, 3)
+        agree[out] = squared_distances(residuals, _blocks(S)) <= gated.limits[out]
     return agree
 
 
@@ -140,67 +138,41 @@ def _blocks(S: Array) -> Array:
     return np.asarray(S.reshape(len(each), 3, len(each), 3)[each, :, each])
 
 
-def _iterate(whitened: Whitened) -> Posterior:
-    """An update whose first linearisation is that of `whitened`.
+def _iterate(innovation: Innovation, used: BoolArray) -> Posterior:
+    """An update by some landmarks (mask (M,)), first linearised as that innovation is: Gauss-Newton on the posterior.
 
-    Gauss-Newton on the posterior (an iterated Kalman filter); a step that raises the cost is shortened. Where the first
-    is far from linear, the guess may be the better next place. One iteration is taken as it is: the papers' filter.
+    Where the first is not linear, the guess is the next place. One iteration is taken as it is: the papers' filter.
+    What comes to lie behind the camera counts no more.
     """
-    components, reached = whitened.innovation.components & whitened.used[:, None], None
-    now, update = whitened.innovation.at, whitened.innovation.at.update
-    for iteration in range(1, update.iterations + 1):
-        innovation, y = whitened.innovation, whitened.y
-        change = np.concatenate([y @ innovation.HP[0], y @ innovation.HP[1]])
+    update, posterior = innovation.at.update, None
+    for iteration in range(update.iterations):
+        if iteration == 1 and update.guess is not None:
+            innovation = update.at(update.camera.at(update.guess)).innovation()
+        elif posterior is not None:
+            innovation = update.at(posterior.camera, posterior.change[CAMERA:]).innovation()
+        used = used & innovation.seen.any(axis=1)
+        whitened = innovation.whitened(used)
+        change = np.delete(whitened.y @ innovation.HP, np.s_[CAMERA : update.covariance.begin])
         if not np.isfinite(change).all():
             raise UnsolvableError("the corrected state is not finite")
-        if update.iterations == 1 or _linear(whitened, change):
-            return Posterior(whitened, change)
-        H = innovation.H
-        towards = np.concatenate([y @ H.by_pose, (y.reshape(-1, 1, 3) @ H.own).reshape(-1)])  # Hᵀ y
-        following, step = _descend(now, components, towards, change)
-        reached = reached if following is now else Posterior(whitened, step)
-        if iteration == 1 and update.guess is not None:
-            guess = update.at_guess()
-            if guess.cost(components) < following.cost(components):
-                following, reached = guess, None
-        if following is now:
+        posterior = Posterior(whitened, change)
+        if update.iterations == 1 or _linear(posterior):
             break
-        if iteration < update.iterations:
-            now, whitened = following, following.innovation(components).whitened(whitened.used)
-    if reached is None:
-        raise UnsolvableError("no step towards the solution lowers the cost")
-    return reached
+    assert posterior is not None  # there is one iteration at least
+    return posterior
 
 
-def _linear(whitened: Whitened, change: Array) -> bool:
+def _linear(found: Posterior) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
-    now, update = whitened.innovation.at, whitened.innovation.at.update
-    following = update.at(now.camera_after(change), change[CAMERA:])
-    step = update.among_measured(change - now.change)
+    whitened, now = found.whitened, found.whitened.innovation.at
+    update = now.update
+    following = update.at(found.camera, found.change[CAMERA:])
+    step = (found.change - now.change)[update.measured]
     seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
-    components = whitened.innovation.components & whitened.used[:, None]
-    errors = np.where(components, following.z - now.z - (now.own @ seen[:, :, None])[:, :, 0], 0.0)
+    errors = following.z - now.z - (now.own @ seen[:, :, None])[:, :, 0]
+    errors = np.where(whitened.innovation.seen & whitened.used[:, None], errors, 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
-    shift = (whitened.inverse @ errors.reshape(-1)) @ whitened.by_pose
+    shift = (whitened.root @ errors.reshape(-1)) @ whitened.by_pose
     variances = update.covariance.pose.diagonal() - (whitened.by_pose**2).sum(axis=0)
     return bool((shift**2 <= _POSE_SHARE**2 * variances).all())
-
-
-def _descend(now: Linearisation, components: BoolArray, s: Array, change: Array) -> tuple[Linearisation, Array]:
-    """The longest of the steps 1, 1/2, 1/4, ... towards ``change = P s`` that does not raise the cost, else now.
-
-    Where it ends, and the step (n,). On the way the distance from the prior, with d here and d' at the end, is that of
-    (1 − a) d + a d'.
-    """
-    update = now.update
-    end, between = (float(s @ update.among_measured(x)) for x in (change, now.change))
-    cost = now.cost(components)
-    for halving in range(_HALVINGS):
-        a = 0.5**halving
-        step = now.change + a * (change - now.change)
-        distance = (1 - a) ** 2 * now.from_prior + 2 * a * (1 - a) * between + a * a * end
-        following = update.at(now.camera_after(step), step[CAMERA:], distance)
-        if following.cost(components) <= cost * (1 + 1e-9):
-            return following, step
-    return now, change

@@ -28,7 +28,6 @@ class FilterState:
 
     stamp: float  # time [s]; NaN before the first prediction
     frame: int  # number of the prediction, −1 before the first
-    dt: float  # time since the last one [s], 0 for the first
     closed: bool  # whether the pose may not be updated any more
     camera: Camera
     landmarks: FilterLandmarks  # all of them
@@ -37,7 +36,7 @@ class FilterState:
     @classmethod
     def first(cls, camera: Camera, P: Array) -> FilterState:
         """Before the first prediction, with the covariance (12, 12) of the camera's error."""
-        return cls(float("nan"), -1, 0.0, True, camera, FilterLandmarks.none(), Covariance.of_camera(P))
+        return cls(float("nan"), -1, True, camera, FilterLandmarks.none(), Covariance.of_camera(P))
 
     # --- the camera ---
 
@@ -55,9 +54,10 @@ class FilterState:
     def advanced(self, stamp: float, motion: Motion) -> FilterState:
         """At a later time, after a motion of the camera."""
         camera, J, noise = motion
-        covariance = self.covariance.with_pose(self.camera.by_error(), RECENT).camera_moved(J, noise)
-        dt, frame = stamp - self.stamp, self.frame + 1
-        return replace(self, stamp=stamp, frame=frame, dt=dt, closed=False, camera=camera, covariance=covariance)
+        covariance = self.covariance.advanced(self.camera.by_error(), RECENT, J, noise)
+        return replace(
+            self, stamp=stamp, frame=self.frame + 1, closed=False, camera=camera, covariance=covariance
+        )  # fmt: skip
 
     def slid(self, coordinates: Coordinates, rows: IndexArray, density: float) -> FilterState:
         """With the slide of some landmarks' features (rows (M,)), seen now from farther round than ever before.
@@ -168,7 +168,7 @@ class FilterState:
         marks.seen[update.rows[found.used]] = self.frame
         J, shift = update.camera.transport(camera), self._shift(marks, camera)
         covariance = update.covariance.corrected(*found.whitened.gain_root(), J, shift)
-        if not (covariance.marks.diagonal() > 0).all():
+        if not (covariance.P.diagonal()[covariance.first :] > 0).all():
             raise UnsolvableError("a landmark's variance would not stay positive")
         return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()
 

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from backends.ekf.camera import AT_REST, Motion, after_gap, motion_noise, prior
+from backends.ekf.camera import prior
 from backends.ekf.covariance import CAMERA, POSE
 from backends.ekf.filter import LandmarkFilter
 from backends.ekf.landmarks import InverseDepth
@@ -82,28 +82,26 @@ class InvariantCamera:
         J[:3, 3:6], J[6:9, 3:6] = hat(self.pose[:3, 3] - to.pose[:3, 3]), hat(self.v - to.v)
         return J
 
-    def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion:
+    def advanced(self, dt: float) -> tuple[InvariantCamera, Array, Array]:
         """See `Camera`: ``R ← R Exp(ω Δt)``, ``p ← p + v Δt``, disturbed by the papers' impulses."""
-        gap = after_gap(models, P, dt)
-        if gap is not None:  # it may be turned anyhow: it stays, independent of the map
-            return self._stopped(), np.zeros((CAMERA, CAMERA)), gap
         R, turn = self.pose[:3, :3], self.rate * dt
         after = se3.nearest_rotation(R @ se3.so3_exp(turn))  # products of many rotations lose digits
         T = se3.pose(after, self.pose[:3, 3] + dt * self.v)
         A = np.eye(CAMERA)
         A[:3, 6:9], A[3:6, 9:] = dt * np.eye(3), dt * R @ se3.so3_left_jacobian(turn)
-        return replace(self, pose=T), A, motion_noise(models, dt, A[:, POSE:])
+        return replace(self, pose=T), A, A[:, POSE:]
 
-    def at_rest(self) -> Motion:
+    def stopped(self) -> InvariantCamera:
         """See `Camera`."""
-        return self._stopped(), AT_REST, np.zeros((CAMERA, CAMERA))
+        return replace(self, v=np.zeros(3), rate=np.zeros(3))
+
+    def of_body(self, P: Array) -> Array:
+        """See `Camera`: turns that are the same about all axes of the body are so about those of the world."""
+        return P
 
     def facing(self, T: Array) -> tuple[InvariantCamera, Array]:
         """See `Camera`: its error is regular everywhere."""
         return self, np.eye(CAMERA)
-
-    def _stopped(self) -> InvariantCamera:
-        return replace(self, v=np.zeros(3), rate=np.zeros(3))
 
 
 @dataclass(frozen=True)

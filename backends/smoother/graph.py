@@ -70,7 +70,10 @@ class Graph:
         self._number, self._taken = -1, 0
         self._base: Array = np.zeros((6, 6))  # what is known of the first pose, besides its prior
         self._poses: dict[int, Array] = {}
-        self._first = np.eye(4)
+        self._first, self._to_state = (
+            np.eye(4),
+            np.eye(4),
+        )  # the first pose; what takes gtsam's coordinates to the state's
         self._kind = False, 0
         self._tie: Tie | None = None  # of its newest pose
 
@@ -84,7 +87,8 @@ class Graph:
         if self._number < s.number and self._is_of(s):
             number, self._number = self._number, -1  # until it is done: an interrupted call leaves a graph unknown
             try:
-                return self._update(s, range(number + 1, s.number + 1), GraphProblem()), ""
+                problem = GraphProblem(to_graph=inverse(self._to_state))
+                return self._update(s, range(number + 1, s.number + 1), problem), ""
             except FAILURES as error:
                 why, self.rebuilds = line(error), self.rebuilds + 1
                 self._careful = s.number + (self._lag or _CAREFUL)
@@ -104,6 +108,11 @@ class Graph:
             return self._update(s, range(oldest, s.number + 1), begin, again)
         except FAILURES as error:
             raise SolverError(line(error)) from error
+
+    def displaced(self, M: Array) -> None:
+        """Follow a displacement M (4, 4) of all that the state has in the world: what is in it is relative."""
+        self._to_state, self._first = M @ self._to_state, M @ self._first
+        self._poses = {number: M @ T for number, T in self._poses.items()}
 
     def oldest(self, s: SmootherState, newest: int | None = None) -> int:
         """Number of the oldest pose in the graph, where the newest one is that of the state, or has another number."""
@@ -134,10 +143,10 @@ class Graph:
         self._tracks.forget(s)
         new = [i for i in numbers if i >= oldest] if self._poses else [s.number]
         values = self._solver.calculateEstimate()
-        poses = np.array([values.atPose3(pose_key(i)).matrix() for i in range(oldest, s.number + 1)])
+        poses = self._to_state @ [values.atPose3(pose_key(i)).matrix() for i in range(oldest, s.number + 1)]
         self._poses = dict(zip(range(oldest, s.number + 1), poses))
         points, linearised = (
-            np.array([v.atPoint3(landmark_key(n)) for n in kept]).reshape(-1, 3)
+            transform(self._to_state, np.array([v.atPoint3(landmark_key(n)) for n in kept]).reshape(-1, 3))
             for v in (values, self._solver.getLinearizationPoint() if kept else values)
         )
         joint = self._joint(list(range(max(oldest, s.number - 1), s.number + 1)))
@@ -174,7 +183,8 @@ class Graph:
             return None
         R = self._first[:3, :3]
         J = R @ points_by_pose(transform(inverse(self._first), position[None]))[0]
-        return np.asarray(self._solver.getISAM2().marginalCovariance(key) + J @ self._base @ J.T)
+        R = self._to_state[:3, :3]
+        return np.asarray(R @ self._solver.getISAM2().marginalCovariance(key) @ R.T + J @ self._base @ J.T)
 
     @property
     def newest(self) -> int:

@@ -35,13 +35,14 @@ def corrected(s: SmootherState, correct: Callable[[Array], Array]) -> SmootherSt
 def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     """The last poses after a correction: the newest one stays where it is, the others and the landmarks move."""
     first = graph.oldest(s)
-    try:
+    now = s.poses[s.of(first) :]
+    with suppress(SolverError):  # then the next update tries again
         now = graph.rebuilt(s, _AGAIN).poses
-    except SolverError:
-        now = s.poses[s.of(first) :]
-    if not s.anchored:
-        now = s.poses[-1] @ inverse(now[-1]) @ now
-        now[-1] = s.poses[-1]
+        if not s.anchored:
+            M = s.poses[-1] @ inverse(now[-1])
+            graph.displaced(M)
+            now = M @ now
+            now[-1] = s.poses[-1]
     D = now[0] @ inverse(s.poses[s.of(first)])
     moved = np.concatenate([D @ s.poses[: s.of(first)], now])
     marks, last = s.landmarks, s.last.copy()
@@ -53,10 +54,7 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     at = -2 if s.inside and len(moved) > 1 else -1  # the pose at which the last frame but one hangs
     last[0] = moved[at] @ inverse(s.poses[at]) @ s.last[0]
     marks = marks.refined(steps.stereo, steps.models.pixel_sigma, s.first, moved)
-    s = replace(s, poses=moved, last=last, landmarks=marks)
-    with suppress(SolverError):  # then the next update tries again
-        graph.rebuilt(s)
-    return s
+    return replace(s, poses=moved, last=last, landmarks=marks)
 
 
 def path_solved(s: SmootherState, make: FactorMaker, before: Array) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
 from backends.smoother.landmarks import VARIABLE
 from backends.smoother.state import SmootherState
-from slam.geometry.se3 import transform
+from slam.geometry.se3 import Array, transform
 
 #: Times of variables, as gtsam's stubs have them.
 Stamps = dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex]
@@ -47,6 +47,7 @@ class GraphProblem:
     grown: dict[tuple[int, int], Track] = field(default_factory=dict)
     # times of variables for the fixed lag: numbers of poses
     stamps: Stamps = field(default_factory=dict)
+    to_graph: Array = field(default_factory=lambda: np.eye(4))  # takes the state's coordinates to gtsam's
 
 
 class Tracks:
@@ -76,7 +77,7 @@ class Tracks:
                 keys = [pose_key(i) for i in range(number - (1 if unknown else 2), number + 1)]
                 factor = self._make.motion(keys, np.diff(tie.times), tie.over)
             problem.factors.add(factor)
-        problem.values.insert(pose_key(number), to_pose3(s.poses[row]))
+        problem.values.insert(pose_key(number), to_pose3(problem.to_graph @ s.poses[row]))
         problem.stamps[pose_key(number)] = float(number)
 
     def add_rows(self, problem: GraphProblem, s: SmootherState, number: int, first: int, begin: int = 0) -> None:
@@ -131,7 +132,7 @@ class Tracks:
             problem.removed.append(track.slot)
         for pose, point in zip(track.poses, track.points):
             problem.factors.add(self._make.explicit(point, pose, serial))
-        problem.values.insert(landmark_key(serial), s.landmarks.position[row[0]])
+        problem.values.insert(landmark_key(serial), transform(problem.to_graph, s.landmarks.position[row])[0])
         self._stays(problem, serial, number)
 
     def _is_variable(
@@ -160,7 +161,7 @@ class Tracks:
             place = known.position
         else:
             problem.factors.add(self._make.known_from(known.pose, serial, known.position, known.covariance))
-            place = transform(s.poses[s.of(known.pose)], known.position[None])[0]
+            place = transform(problem.to_graph @ s.poses[s.of(known.pose)], known.position[None])[0]
         problem.values.insert(landmark_key(serial), place)
 
     def make_smart(self, problem: GraphProblem, careful: bool = True) -> list[tuple[Track, int]]:

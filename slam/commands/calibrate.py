@@ -86,8 +86,8 @@ def _print(found: dict[str, Any]) -> None:
         table.add_column(name, justify="right", no_wrap=True)
     for k, row in enumerate(found["parameters"]):
         factor, unit = unit_of(row, found["rig"]["focal"])
-        own = [row, *(one["parameters"][k] for one in shown)]
-        cells = [f"{factor * one['mean']:.2f} ± {factor * one['sigma']:.2f}" for one in own]
+        own = [row, *(one["pairs"] and one["parameters"][k] for one in shown)]  # none of what is left out
+        cells = [f"{factor * one['mean']:.2f} ± {factor * one['sigma']:.2f}" if one else "–" for one in own]
         if apart:
             cells.append(f"{apart[k]:.1f} σ" if np.isfinite(apart[k]) else "–")
         table.add_row(row["name"], unit, *cells, f"± {factor * found['usual'][k]:.2g}")

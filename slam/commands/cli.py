@@ -15,7 +15,7 @@ from typing import Annotated, Any, TypeAlias
 
 import typer
 
-from slam.commands.ending import catch_signals, leaving, one_line_errors, whole_frames
+from slam.commands.ending import catch_signals, one_line_errors, whole_frames
 from slam.registry import ONLINE
 from slam.runtime.memory import require_address_space
 
@@ -112,15 +112,8 @@ def demo_command(
 
 @app.command("run", short_help="Run one sequence through one back end.")
 def run_command(
-    sequence: Annotated[
-        _Text,
-        argument(
-            "A folder, a ROS recording, camera:0, or synthetic:NAME?key=value; with --config the earlier one.",
-            "SEQUENCE",
-        ),
-    ] = None,
+    sequence: Annotated[str, argument("A folder, a ROS recording, camera:0, or synthetic:NAME?key=value.", "SEQUENCE")],
     out: _RunOut = None,
-    config: Annotated[_File, option("config.json of an earlier run; other options change it.", "FILE")] = None,
     backend: _Backend = None,
     frontend: Annotated[_Text, option("Front end, see `slam list`; default: surf.", "NAME")] = None,
     settings: _Set = None,
@@ -154,15 +147,13 @@ def run_command(
     from slam.run.warm_up import compile_kernels
     from slam.sequences import is_live, with_mask
 
-    sequence = None if sequence is None else with_mask(sequence, mask)
-    if sequence is None and mask is not None:
-        raise ConfigurationError("--mask goes with a SEQUENCE; --config repeats a run with its own")
     if draw_map and draw is None:
         raise ConfigurationError("--draw-map draws beside the frames: give --draw FILE.mp4, or a folder, too")
     with noting_inputs() as inputs:
         opened, options = prepare(
-            sequence, config, settings or (), frames, backend=backend, frontend=frontend, kind=kind, format=format,
-            prior_map=prior_map, mono=mono, calibration=calibration, record=record, save_map=save_map, live=live,
+            with_mask(sequence, mask), settings or (), frames, backend=backend, frontend=frontend, kind=kind,
+            format=format, prior_map=prior_map, mono=mono, calibration=calibration, record=record, save_map=save_map,
+            live=live,
         )  # fmt: skip
     shown_as = frame_count(opened, options.start, options.stop), title(opened, options.backend), quiet
     with ExitStack() as stack:
@@ -249,13 +240,12 @@ def compare_command(
     sequences: Annotated[list[str], argument("Folders, or synthetic:NAME?key=value.", "SEQUENCE")],
     out: Annotated[Path, option("Folder; a comparison that was stopped in it goes on.", "DIR", "--out", "-o")],
     backends: Annotated[str, option("Back ends; the first is the reference.", "A,B,...")] = ",".join(ONLINE),
-    frontends: Annotated[str, option("Front ends; simulated: a world's own features, no images.", "A,B,...")] = "",
-    variant: Annotated[list[str] | None, option("A front end, NAME:FRONTEND:KEY=VALUE:...", "VARIANT")] = None,
+    frontend: Annotated[str, option("Front end; simulated: a world's own features, no images.", "NAME")] = "surf",
     settings: _Set = None,
     mask: _Mask = None,
     trials: Annotated[int, option("Seeds 0 to N - 1 of every synthetic world.", "N", min=1)] = 12,
     frames: _Frames = None,
-    replay: Annotated[bool, option("Also feed the first back end's measurements to all.")] = True,
+    replay: Annotated[bool, option("Also feed the first back end's measurements to all.", None, "--replay")] = False,
     workers: Annotated[int | None, option("Processes; default: the number of cores.", "N")] = None,
     overwrite: _Overwrite = False,
     quiet: Annotated[bool, option("No progress, no conclusions.", None, "--quiet", "-q")] = False,
@@ -267,12 +257,10 @@ def compare_command(
     from slam.run.options import parse_frames
     from slam.sequences import with_mask
 
-    sequences = [with_mask(text, mask) for text in sequences]
-    names = [[word for word in text.split(",") if word] for text in (backends, frontends)]
-    variants = command.variants_of(names[1], variant or [], settings or [])
-    plan = Plan(tuple(sequences), tuple(names[0]), variants, trials, *parse_frames(frames), replay)
-    with leaving("trials done so far are kept: the same command continues"):
-        command.compare(plan, out, workers, quiet, overwrite, command_line())
+    masked, names = (with_mask(text, mask) for text in sequences), filter(None, backends.split(","))
+    start, stop = parse_frames(frames)
+    plan = Plan(tuple(masked), tuple(names), frontend, tuple(settings or ()), trials, start, stop, replay)
+    command.compare(plan, out, workers, quiet, overwrite, command_line())
 
 
 @app.command("calibrate", short_help="Find a stereo rig's error from its recordings.")
@@ -293,8 +281,7 @@ def calibrate_command(
     from slam.sequences import with_mask
 
     texts = [with_mask(text, mask) for text in sequences]
-    with leaving("nothing is written"):
-        calibrate(texts, out, settings or [], parse_frames(frames), format, quiet, opencv, overwrite)
+    calibrate(texts, out, settings or [], parse_frames(frames), format, quiet, opencv, overwrite)
 
 
 @app.command("render", short_help="Write a built-in sequence as a folder.")

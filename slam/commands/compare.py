@@ -8,10 +8,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from slam import registry
-from slam.compare.plan import CLOSED_LOOP, SIMULATED, Plan, Trial, Variant, is_world, parse_variant
+from slam.compare.plan import CLOSED_LOOP, SIMULATED, Plan, Trial, is_world
 from slam.compare.report import write_report
 from slam.compare.sweep import Run, check, is_done, run_jobs, sweep
-from slam.compare.tables import caution, groups, most_tests, write_tables
+from slam.compare.tables import caution, groups, write_tables
 from slam.compare.trial import COMPLETED, RESULT
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, UnknownNameError
@@ -23,24 +23,6 @@ from slam.settings import require_settable
 
 _MOST_WORKERS = 1024
 _TRIED = 15  # frames by which the time of a comparison is told
-
-
-def variants_of(frontends: Sequence[str], variants: Sequence[str], settings: Sequence[str]) -> tuple[Variant, ...]:
-    """Front ends by name and variants by their texts; `settings` hold for all.
-
-    Raises:
-        ConfigurationError: a variant is not of its form, or has a setting that users cannot set.
-        UnknownNameError: there is no such front end.
-    """
-    every = [Variant(name, name, tuple(settings)) for name in frontends]
-    every += [parse_variant(text, tuple(settings)) for text in variants]
-    every = every or [Variant("surf", "surf", tuple(settings))]
-    known = [*registry.names("frontends"), SIMULATED]
-    for variant in every:
-        if variant.frontend not in known and ":" not in variant.frontend:
-            raise UnknownNameError(f"{unknown('front end', variant.frontend, known)}; or one of your own: module:Class")
-        require_settable(variant.settings, SystemConfig().to_json(), variant.frontend)
-    return tuple(every)
 
 
 def compare(
@@ -66,28 +48,20 @@ def compare(
     """
     from slam.commands.display import counting, print_conclusions
 
-    if workers is not None and not 1 <= workers <= _MOST_WORKERS:
-        wanted = "at least one worker" if workers < 1 else f"at most {_MOST_WORKERS} workers"
-        raise ConfigurationError(f"comparison: there must be {wanted}, got {workers}")
-    for text in plan.sequences:
-        if text in registry.names("backends") and not Path(text).exists():
-            names = ",".join([*plan.backends, text])
-            raise ConfigurationError(
-                f"{text}: a back end, no sequence; several are joined by commas: --backends {names}"
-            )
-    count = workers or available_cores()
-    where = f"{count} at a time on this machine"
+    _require_names(plan)
+    count = available_cores() if workers is None else workers
+    if not 1 <= count <= _MOST_WORKERS:
+        raise ConfigurationError(f"comparison: workers must be from 1 to {_MOST_WORKERS}, got {count}")
     frames = check(plan, out, overwrite)  # before there is a progress bar
     total, done = sum(frames[trial.sequence] for trial in plan.every), 0
-    limits = caution(plan.trials if any(map(is_world, plan.sequences)) else 1, most_tests(plan))
+    limits = caution(plan, plan.trials if any(map(is_world, plan.sequences)) else 1)
     if not quiet:
         left = [trial for trial in plan.every if overwrite or not is_done(trial, out)]
         before = f", {len(plan.every) - len(left)} of them done before" if len(left) < len(plan.every) else ""
         seconds = _seconds(left, frames) if left else None
         about = "" if seconds is None else f": about {seconds / min(count, len(left)):.0f} s, by the first frames"
-        print(f"{len(plan.every)} runs{before}, {total} frames in all, {where}{about}")
-        if most_tests(plan):
-            print(limits or f"{plan.trials} trials are enough for certainty in all figures.", flush=True)
+        print(f"{len(plan.every)} runs{before}, {total} frames in all, {count} at a time{about}")
+        print(limits, flush=True)
     with said_before(), counting(total, "frames", quiet) as tell:  # `check` has said what opening says
 
         def ended(trial: Trial) -> None:
@@ -98,19 +72,31 @@ def compare(
         runs = sweep(plan, out, count, ended, overwrite)
     every = groups(plan, runs)
     write_tables(every, runs, out)
-    report = write_report(plan, every, runs, out, where, command)
+    report = write_report(plan, every, runs, out, limits, command)
     if not quiet:
-        print_conclusions(every, limits)
+        print_conclusions(every)
         print(f"{len(runs)} runs, {sum(not run.completed for run in runs)} failed. Report: {report}")
     return runs
 
 
+def _require_names(plan: Plan) -> None:
+    """Raise where there is no such front end, a setting cannot be set, or a back end is given as a sequence."""
+    known = [*registry.names("frontends"), SIMULATED]
+    if plan.frontend not in known and ":" not in plan.frontend:
+        raise UnknownNameError(f"{unknown('front end', plan.frontend, known)}; or one of your own: module:Class")
+    require_settable(plan.settings, SystemConfig().to_json(), plan.frontend)
+    for text in plan.sequences:
+        if text in registry.names("backends") and not Path(text).exists():
+            names = ",".join([*plan.backends, text])
+            hint = f"a back end, no sequence; several are joined by commas: --backends {names}"
+            raise ConfigurationError(f"{text}: {hint}")
+
+
 def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
-    """How long these runs take one after the other [s], by the first frames of one of each kind; None if one fails."""
-    seconds, tried = 0.0, dict[tuple[str, Variant], dict[str, float]]()
+    """How long these runs take one after the other [s], by the first frames of each sequence; None if a run fails."""
+    seconds, tried = 0.0, dict[str, dict[str, float]]()
     for trial in left:
-        kind = trial.sequence, trial.variant
-        if kind not in tried:
+        if trial.sequence not in tried:
             with said_before(), TemporaryDirectory(prefix="slam_trial_") as folder:
                 stop = trial.start + min(_TRIED, frames[trial.sequence])
                 first = replace(trial, seed=0, mode=CLOSED_LOOP, stop=stop)
@@ -118,8 +104,8 @@ def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
                 result = read_object(Path(folder) / RESULT)
             if result["outcome"] != COMPLETED:
                 return None
-            tried[kind] = result["milliseconds"]
-        times = tried[kind]
+            tried[trial.sequence] = result["milliseconds"]
+        times = tried[trial.sequence]
         spent = times.get("total", 0.0)
         if trial.mode != CLOSED_LOOP:  # a replay: without images
             spent -= times.get("read", 0.0) + times.get("extract", 0.0)

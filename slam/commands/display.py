@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from slam.compare.tables import Group
 
 _console = Console()
-_COLOURS = {"better": "green", "worse": "dark_orange3", "": "default"}  # of badges, by direction
+_COLOURS = {"better": "green", "worse": "dark_orange3"}  # of verdicts
 
 
 def _bar(*columns: ProgressColumn, quiet: bool, **options: Any) -> RichProgress:
@@ -69,11 +69,10 @@ def counting(total: int | None, title: str, quiet: bool = False) -> Iterator[Cal
         yield lambda done: bar.update(task, completed=done)
 
 
-def print_conclusions(every: Sequence[Group], caution: str) -> None:
-    """What may be concluded of each group, in the words of the report, and what so few trials can show at best."""
+def print_conclusions(every: Sequence[Group]) -> None:
+    """What may be concluded of each group, in the words of the report."""
     from slam.compare import tables
 
-    used = set()
     for group in every:
         _say(f"\n{group.name}", "bold")
         for text in tables.sentences(group):
@@ -83,16 +82,12 @@ def print_conclusions(every: Sequence[Group], caution: str) -> None:
             if not metric.main:
                 continue
             first, *others = tables.row(group, metric)
-            used |= {cell["verdict"] for cell in others if cell["direction"]}
-            cells = [f"{cell['mean']} [{_COLOURS[cell['direction']]}]{cell['badge']}[/]" for cell in others]
+            words = ((cell["mean"], _COLOURS.get(cell["verdict"], "default"), cell["verdict"]) for cell in others)
+            cells = [f"{mean} [{colour}]{verdict}[/]" for mean, colour, verdict in words]
             table.add_row(escape(metric.title), first["mean"], *cells)
         _console.print(table, highlight=False)
         for text in tables.honesty(group):
             _say(text)
-    if meanings := [meaning for verdict, meaning in tables.STRENGTH.items() if verdict in used]:
-        _say(f"Better or worse than {next(iter(every[0].runs))}: {'; '.join(meanings)}.")
-    if caution:
-        _say(caution)
 
 
 def _table(title: str, names: Iterable[str]) -> Table:

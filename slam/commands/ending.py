@@ -59,16 +59,6 @@ def _stop(number: int, frame: object) -> None:
 
 
 @contextmanager
-def leaving(text: str) -> Iterator[None]:
-    """Work of which a signal leaves something: `text` says what."""
-    try:
-        yield
-    except Stopped as stopped:
-        stopped.leaves = text
-        raise
-
-
-@contextmanager
 def whole_frames(
     after_frame: Callable[[FrameResult], None], folder: Path, until: threading.Event | None = None
 ) -> Iterator[Callable[[FrameResult], None]]:

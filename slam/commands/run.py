@@ -1,8 +1,7 @@
-"""``slam run``: what the command line and the ``config.json`` of an earlier run together ask for."""
+"""``slam run``: what the command line asks for, the folder of a run, and how it ends."""
 
 from __future__ import annotations
 
-import logging
 import re
 import shlex
 import sys
@@ -19,7 +18,7 @@ from slam.commands.display import print_summary
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError
 from slam.outputs import Output
-from slam.run.options import RunOptions, changed_versions, load, parse_frames, versions
+from slam.run.options import RunOptions, parse_frames
 from slam.run.plots import leave_picture
 from slam.run.recording import Recording
 from slam.sequences import Sequence as StereoSequence
@@ -32,43 +31,24 @@ _LONGEST = 60  # characters of a sequence's name in a folder's
 
 
 def prepare(
-    sequence: str | None,
-    config: Path | None = None,
-    settings: Sequence[str] = (),
-    frames: str | None = None,
-    **choices: Any,
+    source: str, settings: Sequence[str] = (), frames: str | None = None, **choices: Any
 ) -> tuple[StereoSequence, RunOptions]:
     """The sequence, opened, and what to do with it; the folder is still to be chosen.
 
-    `choices` are fields of `RunOptions`, None or False where the command line says nothing; `config` is the
-    ``config.json`` of an earlier run, whose choices hold then. Raises SlamError on bad input.
+    `choices` are fields of `RunOptions`, None or False where the command line says nothing. Raises SlamError on bad
+    input.
     """
     said = {name: value for name, value in choices.items() if value}
-    before, made_with = RunOptions(_BACKEND, _FRONTEND, SystemConfig(), source=sequence or ""), dict[str, str]()
-    if config is not None:
-        before, made_with = load(config, sequence, said.get("prior_map"), said.get("calibration"))
-        if "kind" in said:
-            raise ConfigurationError("--kind does not go with --config: settings of a kind of motion are already in it")
-        if sequence is not None:  # which has a format of its own
-            before = replace(before, format=None)
-    options = replace(before, **said)
-    if not options.source and sequence is None:
-        raise ConfigurationError("name a sequence (see `slam list`), or --config FILE of an earlier run")
-    opened = open_sequence(options.source, format=options.format)
+    options = replace(RunOptions(_BACKEND, _FRONTEND, SystemConfig(), source=source), **said)
+    opened = open_sequence(source, format=options.format)
     if options.mono and options.prior_map is None:
         raise ConfigurationError("--mono needs --map FILE: left images alone do not tell how large the world is")
     kind = options.kind or opened.kind
-    chosen = SystemConfig.for_kind(kind, options.frontend)
-    if config is not None:  # options of another front end or back end than its are the defaults
-        if changed := changed_versions(made_with, versions()):
-            logging.getLogger(__name__).warning("made with other versions, results may differ: %s", "; ".join(changed))
-        parts = ("frontend", "backend")
-        other = [part for part in parts if getattr(options, part) != getattr(before, part)]
-        chosen = replace(before.config, **{part: getattr(chosen, part) for part in other})
-    require_settable(settings, chosen.to_json(), options.frontend)
-    chosen = chosen.with_settings([*(["map.monocular=true"] if options.mono else []), *settings])
-    start, stop = (options.start, options.stop) if frames is None else parse_frames(frames)
-    return opened, replace(options, config=chosen, start=start, stop=stop, kind=kind, command=command_line())
+    config = SystemConfig.for_kind(kind, options.frontend)
+    require_settable(settings, config.to_json(), options.frontend)
+    config = config.with_settings([*(["map.monocular=true"] if options.mono else []), *settings])
+    start, stop = parse_frames(frames)
+    return opened, replace(options, config=config, start=start, stop=stop, kind=kind, command=command_line())
 
 
 def title(sequence: StereoSequence | Recording, backend: str) -> str:
@@ -103,7 +83,8 @@ def finish(summary: dict[str, Any], written: Sequence[Output], picture: bool, qu
         print(f"slam: {summary['tracking']}{no_picture}", file=sys.stderr)
     if doubt := summary.get("doubt"):
         if not summary["tracking"]:
-            print(f"slam: do not trust this path: {doubt}", file=sys.stderr)
+            red = ("\x1b[31m", "\x1b[0m") if sys.stderr.isatty() else ("", "")
+            print(f"{red[0]}slam: do not trust this path: {doubt}{red[1]}", file=sys.stderr)
         raise typer.Exit(1)
     if summary["frames"] > 1 and not summary["status"].get("tracked"):
         raise typer.Exit(1)

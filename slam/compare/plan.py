@@ -1,11 +1,11 @@
-"""What a comparison runs: sequences × settings × back ends × seeds, in pairs that differ in the back end alone."""
+"""What a comparison runs: sequences × back ends × seeds, in pairs that differ in the back end alone."""
 
 from __future__ import annotations
 
 import hashlib
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from slam.errors import ConfigurationError
 
@@ -20,28 +20,14 @@ CLOSED_LOOP, REPLAY = "closed loop", "replay"
 
 
 @dataclass(frozen=True)
-class Variant:
-    """A front end and settings, the same for every back end.
-
-    Attributes:
-        name: shown in the tables.
-        frontend: a name, or `SIMULATED`.
-        settings: ``section.key=value``, applied in their order.
-    """
-
-    name: str
-    frontend: str = "surf"
-    settings: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class Plan:
     """All of a comparison.
 
     Attributes:
         sequences: as `slam.open_sequence` takes them.
         backends: names; differences are taken from the first.
-        variants: front ends and settings.
+        frontend: a name, or `SIMULATED`.
+        settings: ``section.key=value``, applied in their order.
         trials: seeds 0, 1, … of every synthetic world; recorded sequences have one trial.
         start, stop: range of frames.
         replay: besides the closed loop, feed the first back end's measurements to every back end.
@@ -52,38 +38,37 @@ class Plan:
 
     sequences: tuple[str, ...]
     backends: tuple[str, ...]
-    variants: tuple[Variant, ...] = field(default_factory=lambda: (Variant("surf"),))
+    frontend: str = "surf"
+    settings: tuple[str, ...] = ()
     trials: int = 1
     start: int = 0
     stop: int | None = None
-    replay: bool = True
+    replay: bool = False
 
     def __post_init__(self) -> None:
-        names = {"sequence": self.sequences, "back end": self.backends, "variant": [v.name for v in self.variants]}
-        for what, every in names.items():
+        for what, every in {"sequence": self.sequences, "back end": self.backends}.items():
             if not every:
                 raise ConfigurationError(f"comparison: no {what} is given")
             twice = next((name for name in every if every.count(name) > 1), None)
             if twice is not None:
                 raise ConfigurationError(f"comparison: {what} {twice!r} is given twice")
         if not 1 <= self.trials <= _MOST_TRIALS:
-            wanted = "at least one trial" if self.trials < 1 else f"at most {_MOST_TRIALS} trials"
-            raise ConfigurationError(f"comparison: there must be {wanted}, got {self.trials}")
+            raise ConfigurationError(f"comparison: trials must be from 1 to {_MOST_TRIALS}, got {self.trials}")
         for sequence in self.sequences:
             if sequence.startswith("camera:"):
                 raise ConfigurationError(f"{sequence}: a camera gives each back end other frames; compare recordings")
             if is_world(sequence) and re.search(r"[?&]seed=", sequence):
                 raise ConfigurationError(f"{sequence}: leave the seed out, the trials have seeds 0 to N − 1")
-            if not is_world(sequence) and any(v.frontend == SIMULATED for v in self.variants):
+            if not is_world(sequence) and self.frontend == SIMULATED:
                 raise ConfigurationError(f"{sequence}: front end {SIMULATED!r} is for synthetic worlds alone")
 
     def trials_of(self, mode: str) -> Iterator[Trial]:
         """All trials of a mode, in the order of the tables."""
+        shared = self.frontend, self.settings, mode, self.start, self.stop
         for sequence in self.sequences:
-            for variant in self.variants:
-                for seed in range(self.trials if is_world(sequence) else 1):
-                    for backend in self.backends:
-                        yield Trial(sequence, variant, backend, seed, mode, self.start, self.stop)
+            for seed in range(self.trials if is_world(sequence) else 1):
+                for backend in self.backends:
+                    yield Trial(sequence, backend, seed, *shared)
 
     @property
     def modes(self) -> tuple[str, ...]:
@@ -101,10 +86,11 @@ class Trial:
     """One run."""
 
     sequence: str  # as the plan has it
-    variant: Variant
     backend: str
-    seed: int  # of the recording of a synthetic world; 0 for recorded sequences
-    mode: str  # `CLOSED_LOOP` or `REPLAY`
+    seed: int = 0  # of the recording of a synthetic world; 0 for recorded sequences
+    frontend: str = "surf"
+    settings: tuple[str, ...] = ()
+    mode: str = CLOSED_LOOP
     start: int = 0
     stop: int | None = None
 
@@ -118,8 +104,8 @@ class Trial:
     @property
     def folder(self) -> str:
         """Where its files go, below the comparison's ``runs``."""
-        names = (_short_name(self.sequence), _short_name(self.variant.name), f"seed_{self.seed}")
-        return "/".join((*names, _short_name(self.backend), self.mode.replace(" ", "_")))
+        names = (_short_name(self.sequence), f"seed_{self.seed}", _short_name(self.backend))
+        return "/".join((*names, self.mode.replace(" ", "_")))
 
 
 def is_world(sequence: str) -> bool:
@@ -133,19 +119,3 @@ def _short_name(text: str) -> str:
     if plain == text.removeprefix(SYNTHETIC) and len(plain) <= 60:
         return plain
     return f"{plain[-48:].strip('_')}_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
-
-
-def parse_variant(text: str, common: tuple[str, ...] = ()) -> Variant:
-    """A variant from ``NAME:FRONTEND:KEY=VALUE:KEY=VALUE…``; settings `common` to all come first.
-
-    Raises:
-        ConfigurationError: not of that form.
-    """
-    name, *parts = [part for part in text.split(":") if part] or [""]
-    frontend = parts.pop(0) if parts and "=" not in parts[0] else ""
-    named = name and not text.startswith(":") and "=" not in name
-    if not named or not (frontend or parts) or any("=" not in part for part in parts):
-        raise ConfigurationError(
-            f"variant {text!r} is not of the form NAME:FRONTEND:KEY=VALUE:…, such as small:surf:frontend.descriptor=16"
-        )
-    return Variant(name, frontend or "surf", (*common, *parts))

@@ -12,7 +12,7 @@ import numpy as np
 
 from slam.compare import tables
 from slam.compare.plan import Plan, is_world
-from slam.compare.statistics import LEVEL, Verdict
+from slam.compare.statistics import LEVEL
 from slam.compare.sweep import SWEEP, Run
 from slam.compare.tables import Group
 from slam.files import read_object, write_text
@@ -27,17 +27,16 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).parent / "templates"
 
 _MOST_TICKS = 15
-_SHORT = 20  # letters of names that stand side by side
 _WIDTH = 5.2  # [in] about that of a phone: text stays readable where the picture fills the screen
 
 
 def write_report(
-    plan: Plan, every: Sequence[Group], runs: Sequence[Run], out: Path, workers: str, command: str = ""
+    plan: Plan, every: Sequence[Group], runs: Sequence[Run], out: Path, caution: str = "", command: str = ""
 ) -> Path:
     """Write ``report.html`` into a comparison's folder, and return its path; it needs no network and no other file.
 
-    `runs` are all of the plan's, also those that failed; `workers` says in words where trials ran, `command` is what
-    was typed.
+    `runs` are all of the plan's, also those that failed; `caution` is what so many trials can show, `command` what was
+    typed.
     """
     from jinja2 import Environment, FileSystemLoader
 
@@ -51,12 +50,9 @@ def write_report(
         runs=runs,
         groups=every,
         words=tables,
-        caution=tables.caution(max(group.trials for group in every), tables.most_tests(plan)),
-        tests=tables.count_tests(every),
-        strengths={verdict.value: tables.STRENGTH[verdict] for verdict in (Verdict.CERTAIN, Verdict.LIKELY)},
+        caution=caution,
         level=round(100 * LEVEL),
         sections=[(own, list(_pictures(own[0]))) for own in modes],
-        workers=workers,
         stages=stages.values(),
         times=[_times(group, backend, stages) for group in every for backend in group.runs],
         command=command,
@@ -70,12 +66,11 @@ def _times(group: Group, backend: str, stages: dict[str, str]) -> tuple[str, ...
     """A row of medians."""
     own = group.runs[backend]
     values = ([run.milliseconds[stage] for run in own if stage in run.milliseconds] for stage in stages)
-    cells = (f"{np.median(each):.2f}" if each else "–" for each in values)
-    return (group.sequence, group.variant.name, group.mode, backend, *cells)
+    return (group.name, backend, *(f"{np.median(each):.2f}" if each else "–" for each in values))
 
 
-def _pictures(group: Group) -> Iterator[tuple[str, str, str]]:
-    """Title, caption and SVG of a group's pictures, as far as there is truth; none where every run failed.
+def _pictures(group: Group) -> Iterator[tuple[str, str]]:
+    """Caption and SVG of a group's pictures, as far as there is truth; none where every run failed.
 
     Shown is the first trial that every back end completed; else the first completed of each.
     """
@@ -88,12 +83,12 @@ def _pictures(group: Group) -> Iterator[tuple[str, str, str]]:
     runs = [RunData.read(run.folder, run.trial.backend) for run in shown]
     of_seed = f", seed {trial.seed}" if is_world(trial.sequence) else ""
     if "ate_online_m" in known and group.trials > 1:
-        label = BY_KEY["ate_online_m"].label
-        yield label, f"{label}, of every trial; lines join runs on the same recording.", _svg(_pairs(group))
-    yield "Paths from above", f"Paths from above{of_seed}.", _svg(drawn(runs, "path"))
+        text = f"{BY_KEY['ate_online_m'].label}, of every trial; lines join runs on the same recording."
+        yield text, _svg(_pairs(group))
+    yield f"Paths from above{of_seed}.", _svg(drawn(runs, "path"))
     if "nees_per_dof" in known:
         text = f"Error of the pose{of_seed} (solid), and the σ that each back end claims (dashed)."
-        yield "Error over time", text, _svg(drawn(runs, "errors"))
+        yield text, _svg(drawn(runs, "errors"))
 
 
 def _pairs(group: Group) -> Figure:
@@ -105,17 +100,14 @@ def _pairs(group: Group) -> Figure:
     axis = figure.subplots()
     values = np.array([metric.scale * group.values(name, metric.key) for name in group.runs])
     backends, trials = values.shape
-    x = np.arange(trials) + (np.linspace(-0.25, 0.25, backends) if backends > 1 else np.zeros(1))[:, None]
+    x = np.arange(trials) + np.linspace(-0.25, 0.25, backends)[:, None]
     axis.plot(x, values, color="0.7", lw=1, zorder=1)
     for at, value, name, colour in zip(x, values, group.runs, backend_colours(list(group.runs))):
         axis.plot(at, value, "o", color=colour, ms=4, alpha=0.8, label=name)
     axis.set(xlim=(-0.5, trials - 0.5), xticks=range(0, trials, -(-trials // _MOST_TICKS)))
-    axis.set(xlabel="seed", ylabel=metric.title)
+    axis.set(xlabel="seed", ylabel=metric.title, ylim=(0, None))
     axis.spines[["top", "right"]].set_visible(False)
-    low, high = float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=1e-9))
-    axis.set_ylim(0 if low < 0.5 * high else low - 0.1 * high, 1.1 * high)  # trifles are not blown up
-    above = {"loc": "lower left", "bbox_to_anchor": (0, 1.0)}  # where it hides nothing
-    axis.legend(frameon=False, fontsize=8, ncols=3 if max(map(len, group.runs)) < _SHORT else 2, **above)
+    axis.legend(frameon=False, fontsize=8, ncols=3, loc="lower left", bbox_to_anchor=(0, 1.0))  # where it hides nothing
     return figure
 
 

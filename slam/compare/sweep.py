@@ -148,8 +148,8 @@ def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
                 sequence = open_sequence(trial.source)
             frames[trial.sequence] = len(range(len(sequence))[trial.start : trial.stop])
             config = config_of(trial, sequence)
-            if trial.variant.frontend != SIMULATED:
-                registry.create("frontends", trial.variant.frontend, sequence.rig, **config.frontend)
+            if plan.frontend != SIMULATED:
+                registry.create("frontends", plan.frontend, sequence.rig, **config.frontend)
             inside = Rectification(sequence.rig)
             models = inside.models(config.models)
             registry.create("backends", trial.backend, inside.rig, models=models, **config.backend)

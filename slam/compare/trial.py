@@ -72,13 +72,13 @@ def keep_result(
 
 def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:
     """All settings of a trial; raises ConfigurationError: a setting is unknown or out of range."""
-    name, first = trial.variant.frontend, []
+    name, first = trial.frontend, list[str]()
     if name == "surf":
         first = ["frontend.threads=1"]  # what it finds does not depend on it
     if name == SIMULATED and isinstance(sequence, WorldSequence) and sequence.values["sigma"]:
         # the noise of these features is known
         first = [f"models.pixel_sigma={sequence.values['sigma']}", "models.slide.density=0"]
-    return SystemConfig.for_kind(sequence.kind, name).with_settings([*first, *trial.variant.settings])
+    return SystemConfig.for_kind(sequence.kind, name).with_settings([*first, *trial.settings])
 
 
 class _Simulated:
@@ -118,11 +118,11 @@ def _run(trial: Trial, recording: Path | None, out: Path) -> tuple[dict[str, flo
         sequence = open_sequence(trial.source)
     collected = MapRecord(sequence, trial.start, closed)
     config = config_of(trial, sequence)
-    options = RunOptions(trial.backend, trial.variant.frontend, config, out, kind=sequence.kind)
+    options = RunOptions(trial.backend, trial.frontend, config, out, kind=sequence.kind)
     if recording is not None:
         summary = run_recording(load_recording(recording), options, collected.add, record)
     else:
-        simulated = _Simulated(sequence) if trial.variant.frontend == SIMULATED else None  # type: ignore[arg-type]
+        simulated = _Simulated(sequence) if trial.frontend == SIMULATED else None  # type: ignore[arg-type]
         options = replace(options, start=trial.start, stop=trial.stop, record=out / RECORDING)
         summary = run(sequence if simulated is None else simulated, options, collected.add, simulated, record=record)
     if not summary["frames"]:

@@ -1,4 +1,4 @@
-"""Whether pose covariances are as large as the errors: NEES from the start, over stretches of the path, and of scale.
+"""Whether pose covariances are as large as the errors: NEES from the start, and over stretches of the path.
 
 With ``T_true = T_estimated exp(e)`` the error of the relative pose from frame i to frame j is, to first order,
 ``e_j − A e_i`` with ``A = Ad((T_i⁻¹ T_j)⁻¹)``. Errors of odometry by noise grow by increments that do not depend on
@@ -50,7 +50,7 @@ def consistency_figures(
         "mean NEES" from the start, "NEES over L m" for each of `STRETCHES`; six is right for all of these, and "band
         low" and "band high" hold 95 % of runs; "doubtful truth over L m" and "no covariance over L m", the shares of
         stretches left out because the truth contradicts itself or an old place was measured again within them, where
-        there are any; "scale error [%]" and "scale sigma [%]".
+        there are any.
     """
     start = int(np.argmin(interpolated(true, noise)))  # the first pose that was measured
     later = np.arange(start + 1, len(own))
@@ -71,7 +71,6 @@ def consistency_figures(
         for what, rows in (("doubtful truth", left_out), ("no covariance", none)):
             if rows.any():
                 figures[f"{what} over {length:g} m"] = float(np.mean(rows))
-    figures.update(_scale(own, true, covariances, noise))
     return figures
 
 
@@ -161,24 +160,6 @@ def _shared(A: Array, ends: Sequence[tuple[CommonError, CommonError]], N: Array)
         else:
             N[row] += last.covariance - a @ first.covariance @ a.T
     return N, G
-
-
-def _scale(own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise) -> dict[str, float]:
-    """Error of the distance from the start to the farthest true pose, and its claimed standard deviation [%]."""
-    away = np.linalg.norm(true.positions - true.positions[0], axis=1)
-    far = int(np.argmax(away))
-    if away[far] < 1.0:
-        return {}
-    way = own.positions[far] - own.positions[0]
-    distance = float(np.linalg.norm(way))
-    if not distance > 0:
-        return {}
-    along = own.poses[far, :3, :3].T @ way / distance
-    variance = float(along @ covariances[far, 3:, 3:] @ along) + 2 * noise.translation**2
-    return {
-        "scale error [%]": 100 * (distance / float(away[far]) - 1),
-        "scale sigma [%]": 100 * float(np.sqrt(max(variance, 0.0))) / float(away[far]),
-    }
 
 
 def _mean(values: Array) -> float:

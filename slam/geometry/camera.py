@@ -228,11 +228,16 @@ def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
                 "columns, differ, but pixels are square: is one of them mistyped, or were images scaled in one way?"
             )
         if alike or np.abs(shares[side]).max() > _OFF:
-            return (
+            said = (
                 f"the principal point of the {side} camera, ({camera.u0:.0f}, {camera.v0:.0f}) px, is far from the "
-                f"middle of the images, ({camera.width / 2:.0f}, {camera.height / 2:.0f}) px: is the calibration for "
-                "images of another size, or were they cropped or turned, or cx and cy exchanged?"
+                f"middle of the images, ({camera.width / 2:.0f}, {camera.height / 2:.0f}) px: "
             )
+            if shares[side].min() > -1 and np.ptp(shares[side]) < _OFF_ALIKE * (1 + shares[side].mean()):
+                return said + (
+                    f"the calibration is for images of about {2 * camera.u0:.0f}x{2 * camera.v0:.0f} px, "
+                    f"{1 + shares[side].mean():.2g} times the size of these, or these were cropped"
+                )
+            return said + "were they cropped or turned, or is the calibration for others, or cx and cy exchanged?"
     return ""
 
 

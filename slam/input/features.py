@@ -17,6 +17,8 @@ from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend
 from slam.models import EstimatorModels
 
+_SHARE = 0.1  # guard: of features outside of the image; by which the lengths of descriptors may differ from 1
+
 #: Columns of `StereoFeatures`: numbers in a row (None for any number), and the dtype that comes out.
 _COLUMNS: dict[str, tuple[tuple[int | None, ...], type]] = {
     "uv_left": ((2,), np.float64), "uv_right": ((2,), np.float64), "scale": ((), np.float64), "angle": ((), np.float64),
@@ -28,7 +30,8 @@ def documented(features: Any, rig: StereoRig) -> StereoFeatures:
     """The features with the documented dtypes; MeasurementError where they are not as `StereoFeatures` says.
 
     That is a wrong type, shape or number of dimensions, a value that is not finite (except NaN in `uv_right`), a pixel
-    farther outside the image than its width or height, a stamp that is no number, or images of another type or size.
+    farther outside the image than its width or height, exchanged x and y, descriptors that are no unit vectors, a stamp
+    that is no number, or images of another type or size.
     """
     if not isinstance(features, StereoFeatures):
         raise MeasurementError(f"features must be StereoFeatures, got {type(features).__name__}")
@@ -43,6 +46,14 @@ def documented(features: Any, rig: StereoRig) -> StereoFeatures:
     for name in ("uv_left", "uv_right"):
         if ((columns[name] < -size) | (columns[name] > 2 * size)).any():  # NaN compares false
             raise MeasurementError(f"features: a pixel of {name} lies far outside of the image")
+    u, v = columns["uv_left"].T
+    if not features.rectified and np.mean([*(v >= size[1]), False]) > _SHARE and (u < size[1]).all():
+        raise MeasurementError("features: uv_left lies below the image: are its columns, x and y, exchanged?")
+    length = float(np.median([*np.linalg.norm(columns["descriptors"].astype(float), axis=1), 1.0]))
+    if columns["descriptors"].any() and abs(length - 1) > _SHARE:
+        raise MeasurementError(
+            f"features: descriptors must be unit vectors; the median of their lengths is {length:.3g}"
+        )
     _require_images(features.images, rig)
     return replace(features, stamp=stamp, threshold=threshold, **columns)
 

@@ -40,7 +40,6 @@ class PairGeometry:
     at_same_place: int = 0  # at one and the same pixel of both images, as they are, not rectified
     off_rows: int = 0  # whose rows differ, by more than the front end finds reliably
     row_offset: float = 0.0  # median difference of their rows [px]
-    level: int = 0  # as_given, if all rows of the right image are shifted by the median difference
     along_columns: int = 0  # with a disparity along columns alone, as of images that are turned
     shown: float = 1.0  # share of what rectification does to rows that the images show; 1 where that may be all
 
@@ -97,7 +96,6 @@ def pair_geometry(rig: StereoRig, left: Points, right: Points, rows: float) -> P
     a, b = (uv[inliers] for uv in pixels)
     band = max(rows, _TOLERANCE)
     shift, offset = _offsets(rig, a, b)
-    middle = float(np.nanmedian(offset)) if np.isfinite(offset).any() else 0.0
     shift_swapped, offset_swapped = _offsets(rig, b, a)
     return PairGeometry(
         len(a),
@@ -107,7 +105,6 @@ def pair_geometry(rig: StereoRig, left: Points, right: Points, rows: float) -> P
         int((np.abs(b - a).max(axis=1) <= _TOLERANCE).sum()),
         int((np.abs(offset) > band - _TOLERANCE + _ROWS_AGREE).sum()),
         float(np.nanmedian(np.abs(offset))) if np.isfinite(offset).any() else 0.0,
-        int(((shift > _TOLERANCE) & (np.abs(offset - middle) <= band)).sum()),
         int(((np.abs(shift) <= _TOLERANCE) & (np.abs(offset) > band)).sum()),
         1.0 if rig.is_rectified else _shown(rig, a, b, left.image, right.image),
     )

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 
@@ -32,8 +30,6 @@ _INTERVALS = 5  # guard: times between frames whose median is tested: single fra
 _POOR = 5  # guard: successive frames that must show too little before a warning
 _LAST_LOOK = 1024  # guard: last frame at which the stereo pair is checked
 _ALIKE = 0.2  # guard: distance of descriptors of which there is hardly a pair in an image without repeated patterns
-_SHIFTS = 2  # guard: frames by which right images are tried to be late or early
-_FITS = 0.95  # guard: share of the matches that fit the rig, below which other frames' images are looked at again
 
 Checksum = tuple[int, int]  # of the bytes of the left and the right image
 
@@ -54,14 +50,11 @@ class InputWarnings:
         self._farthest = farthest_apart(rig, models)
         self._stamps: list[float] = []
         self._count = self._poor = self._unpaired = 0
-        self._pair_warned = self._pair_is_right = self._moment_is_right = False
+        self._pair_warned = self._pair_is_right = False
         self._texture_warned = self._partners_explained = False
         self._two_images = self._copy_warned = False  # a pair of different images was seen, a copy was named
         self._last: Checksum | None = None  # of the frame before
         self._last_copy = ""  # why its right image was a copy
-        self._before: deque[_Images] = deque(maxlen=_SHIFTS)  # the frames before, the last one first
-        self._fits = np.zeros(1 + 2 * _SHIFTS, int)  # matches if right images are a frame late, early, two late, …
-        self._level = 0  # of the same frames, if rows are shifted
         self._grain_warned = False
         for unlikely in filter(None, (baseline_doubt(rig.baseline), size_doubt(rig.left, rig.right))):
             self._warn(unlikely, no_path=True)
@@ -73,27 +66,20 @@ class InputWarnings:
         Raises SequenceError, with nothing changed, where left and right are exchanged for certain: no pair before was
         right, features fit the rig the other way round, and hardly any has a right match as it is.
         """
-        own, images = None, _Images(frame, self._rig)
         looked_at = self._count & (self._count - 1) == 0 and self._count <= _LAST_LOOK  # 0, 1, 2, 4 …
         if looked_at and not self._grain_warned and (grain := grain_doubt(frame.left)):
             self._grain_warned = True
             self._warn(grain)
         if looked_at and not self._pair_warned:
-            own = self._geometry(images, images)
-            unpaired = 10 * int(features.has_stereo.sum()) < len(features)
-            if own is not None and not self._pair_is_right and own.swapped and unpaired:
-                raise SequenceError(_swapped(own))
+            self._check_pair(frame, features)
         if len(self._stamps) <= _INTERVALS:
             self._stamps.append(features.stamp)
             if len(self._stamps) > _INTERVALS:
                 self._check_intervals(float(np.median(np.diff(self._stamps))))
         if not self._texture_warned:
             self._check_texture(frame.left, len(features))
-        if own is not None:
-            self._check_pair(images, own)
         if not self._partners_explained and frame.right is not None:
             self._check_partners(features)
-        self._before.appendleft(images)
         self._count += 1
 
     def _check_intervals(self, interval: float) -> None:
@@ -145,77 +131,67 @@ class InputWarnings:
             f"only {stereo} of {len(features)} features of frame {self._count} are found in the right image{cause}"
         )
 
-    def _check_pair(self, images: _Images, own: PairGeometry) -> None:
-        """Warn if left and right image look swapped or the same, are of different moments, or rows do not match."""
-        if not self._pair_is_right and (own.swapped or own.same):
+    def _check_pair(self, frame: StereoFrame, features: StereoFeatures) -> None:
+        """Warn if left and right image look swapped, mirrored or the same, or rows do not match.
+
+        Where half of the features have a right pixel, in images that are rectified, they are a pair.
+        """
+        stereo = int(features.has_stereo.sum())
+        if 2 * stereo >= max(len(features), ENOUGH_FEATURES) and (self._rig.is_rectified or self._pair_is_right):
+            self._pair_is_right = True
+            return
+        left, right = (_points(image, self._rig) for image in (frame.left, frame.right))
+        if left is None or right is None:
+            return
+        try:
+            own = pair_geometry(self._rig, left, right, self._rows)
+        except CalibrationError:  # the rig cannot be rectified: a front end may not need that
             self._pair_warned = True
+            return
+        if not self._pair_is_right and own.swapped and 10 * stereo < len(features):
+            raise SequenceError(_swapped(own))
+        said = ""
+        if not self._pair_is_right and own.swapped:
+            said = _swapped(own)
+        elif not self._pair_is_right and own.same:
             horizon = self._rig.rectified.rig.left.fu * self._rig.baseline / NO_DISPARITY
-            same = (
+            said = (
                 f"left and right image show the same: {own.at_same_place} of {own.matches} features have no "
                 f"disparity; this is one image twice, or nothing in view is nearer than {horizon:.0f} m"
             )
-            self._warn(_swapped(own) if own.swapped else same, no_path=True)
-        elif not self._pair_is_right and self._before and own.shown < 1:
-            if len(self._before) == _SHIFTS:  # hardly a feature fits then, and of another moment's some may by chance
-                self._pair_warned = True
-                self._warn(self._rows_differ(images, own), no_path=True)
-        elif self._before and (not self._moment_is_right or own.as_given < _FITS * own.matches):
-            self._check_moment(images, own)
-        self._partners_explained |= self._pair_warned  # the reason is known then
+        elif 4 * stereo < len(features) and not most(own.as_given, own.matches - own.as_given):
+            said = self._mirrored(left, right, own)
+        if not said and (own.rows_differ or (own.shown < 1 and not self._pair_is_right)):
+            said = self._transposed(left, right, own) or _rows_differ(own, self._rig)
+        self._pair_is_right |= own.conclusive
+        if said:
+            self._pair_warned = self._partners_explained = True  # the reason is known then
+            self._warn(said, no_path=True)
 
-    def _check_moment(self, images: _Images, own: PairGeometry) -> None:
-        """Warn if left images fit the right ones of other frames, or else if rows do not match."""
-        others = [self._geometry(*pair) for other in self._before for pair in ((other, images), (images, other))]
-        fits = [other.as_given for other in others if other is not None]
-        if len(fits) == len(others):
-            self._fits[: 1 + len(fits)] += [own.as_given, *fits]
-            self._level += own.level
-        fit, *shifted = self._fits.tolist()
-        if most(max(shifted), fit) and not most(self._level, max(shifted)):
-            self._pair_warned = True
-            at = int(np.argmax(shifted))
-            which, wrong = ("after", "early") if at % 2 else ("before", "late")
-            frames, number = ("a frame", "one") if at < 2 else ("two frames", "two")
-            since = "left and right image are not of one moment" + ", though they were" * self._moment_is_right
-            self._warn(
-                f"{since}: {max(shifted)} features fit the rig with the left image {frames} {which}, {fit} with that "
-                f"of the same frame, {self._count}; the right images are {frames} too {wrong}: pair them by their "
-                f"times, or shift their numbers by {number}",
-                no_path=True,
-            )
-            return
-        if all(most(fit, other) for other in shifted):
-            self._moment_is_right = True
-            self._fits[:] = self._level = 0  # what comes later is counted anew
-        if own.conclusive and not self._pair_is_right and (not own.rows_differ or len(self._before) == _SHIFTS):
-            self._pair_is_right = True
-            if own.rows_differ:
-                self._pair_warned = True
-                self._warn(self._rows_differ(images, own), no_path=True)
+    def _mirrored(self, left: Points, right: Points, own: PairGeometry) -> str:
+        """That far more features are found in the mirrored right image, where they are."""
+        flipped = pair_geometry(self._rig, left, points_of(np.ascontiguousarray(right.image[:, ::-1])), self._rows)
+        if not (flipped.conclusive and most(flipped.matches, own.matches)):
+            return ""
+        return (
+            f"one of the images looks mirrored: {flipped.matches} features are found in the mirrored right image, and "
+            f"{own.matches} in it as it is; give both images as their cameras see"
+        )
 
-    def _rows_differ(self, images: _Images, own: PairGeometry) -> str:
-        """That rows do not agree, and the likely cause."""
+    def _transposed(self, left: Points, right: Points, own: PairGeometry) -> str:
+        """That rows agree with the inverse of the calibration's rotation, where they do."""
         rig = self._rig
-        if not rig.is_rectified and images.left is not None and images.right is not None:
-            with suppress(CalibrationError):
-                inverse = pair_geometry(replace(rig, R=rig.R.T), images.left, images.right, self._rows)
-                if not inverse.rows_differ and most(inverse.as_given, own.as_given):
-                    return (
-                        f"rows of left and right image agree with the inverse of the calibration's rotation, "
-                        f"{inverse.as_given} features, and {own.as_given} as it is: is R transposed, or from the right "
-                        "camera to the left one?"
-                    )
-        return _rows_differ(own, rig)
-
-    def _geometry(self, left: _Images, right: _Images) -> PairGeometry | None:
-        """How one frame's left image fits another's right one; None where an image is missing or unusable."""
-        if left.left is None or right.right is None:
-            return None
-        try:
-            return pair_geometry(self._rig, left.left, right.right, self._rows)
-        except CalibrationError:  # the rig cannot be rectified: a front end may not need that
-            self._pair_warned = True
-            return None
+        if rig.is_rectified:
+            return ""
+        with suppress(CalibrationError):
+            inverse = pair_geometry(replace(rig, R=rig.R.T), left, right, self._rows)
+            if not inverse.rows_differ and most(inverse.as_given, own.as_given):
+                return (
+                    f"rows of left and right image agree with the inverse of the calibration's rotation, "
+                    f"{inverse.as_given} features, and {own.as_given} as it is: is R transposed, or from the right "
+                    "camera to the left one?"
+                )
+        return ""
 
     def copied(self, frame: StereoFrame, checksum: Checksum | None) -> tuple[Checksum | None, str]:
         """Why the right image is a copy, which measures nothing (empty if it is none), and the frame's checksum.
@@ -273,10 +249,23 @@ def _swapped(found: PairGeometry) -> str:
 
 def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
     """That rows do not agree, and the likely cause: images that were rectified twice, or never."""
+    left, right = rig.left, rig.right
+    plain = not (left.has_distortion or right.has_distortion or np.abs(rig.R - np.eye(3)).max() > 1e-9)
     if found.turned:
         cause = "the images are turned by 90°, or the cameras stand above each other: turn both, or calibrate them so"
-    elif not (rig.left.has_distortion or rig.right.has_distortion or np.abs(rig.R - np.eye(3)).max() > 1e-9):
-        cause = "were they rectified, as this calibration says (no distortion or rotation), and are they of one moment?"
+    elif found.shown < 1 and plain:
+        fx, fy, cy = (
+            f"{a:.1f} and {b:.1f}" for a, b in ((left.fu, right.fu), (left.fv, right.fv), (left.v0, right.v0))
+        )
+        return (
+            f"rows of left and right image show {100 * max(found.shown, 0.0):.0f} % of what rectification by focal "
+            f"lengths and principal points does to them (fx {fx}, fy {fy}, cy {cy} px): is one of them mistyped?"
+        )
+    elif plain:
+        cause = (
+            "were they rectified, as this calibration says (no distortion or rotation), and are they of one moment, or "
+            "must numbers be shifted by one?"
+        )
     elif found.shown < 1:
         return (
             f"rows of left and right image show {100 * max(found.shown, 0.0):.0f} % of what the calibration's "
@@ -284,7 +273,7 @@ def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
             "calibration after that, or leave the distortion out"
         )
     else:
-        cause = "check that the calibration is this camera's, at this size"
+        cause = "check that the calibration is this camera's, at this size, and that both images are of one moment"
     return (
         f"rows of left and right image do not agree: {found.off_rows} of {found.matches} features are off by "
         f"{found.row_offset:.1f} px in the median; {cause}"
@@ -307,31 +296,15 @@ def shows_something(image: object) -> bool:
     return bool(image.min() != image.max())
 
 
-class _Images:
-    """The points of a frame's images, found once, when they are asked for.
+def _points(image: np.ndarray | None, rig: StereoRig) -> Points | None:
+    """The points of an image; None where it is missing or unusable: the front end refuses it, or has its own format."""
+    import cv2
 
-    They are None where an image is missing or unusable: the front end refuses it, or has a format of its own.
-    """
-
-    def __init__(self, frame: StereoFrame, rig: StereoRig) -> None:
-        self._frame, self._size = frame, (rig.height, rig.width)
-
-    @cached_property
-    def left(self) -> Points | None:
-        return self._points(self._frame.left)
-
-    @cached_property
-    def right(self) -> Points | None:
-        return self._points(self._frame.right)
-
-    def _points(self, image: np.ndarray | None) -> Points | None:
-        import cv2
-
-        if not isinstance(image, np.ndarray) or image.dtype not in (np.uint8, np.uint16):
-            return None
-        if image.shape[:2] != self._size or image.shape[2:] not in ((), (1,), (3,), (4,)):
-            return None
-        if image.ndim == 3:
-            one = image.shape[2] == 1
-            image = image[:, :, 0] if one else np.asarray(cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY))
-        return points_of(np.ascontiguousarray(eight_bits(image)))
+    if not isinstance(image, np.ndarray) or image.dtype not in (np.uint8, np.uint16):
+        return None
+    if image.shape[:2] != (rig.height, rig.width) or image.shape[2:] not in ((), (1,), (3,), (4,)):
+        return None
+    if image.ndim == 3:
+        one = image.shape[2] == 1
+        image = image[:, :, 0] if one else np.asarray(cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY))
+    return points_of(np.ascontiguousarray(eight_bits(image)))

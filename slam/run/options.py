@@ -1,8 +1,7 @@
-"""What to run, with what, and where the files go; and what it takes to repeat it, in the run's ``config.json``."""
+"""What to run, with what, and where the files go; and what the run's ``config.json`` says of it."""
 
 from __future__ import annotations
 
-import math
 import os
 import platform
 from collections.abc import Mapping
@@ -14,12 +13,11 @@ from typing import Any
 from slam.calibration import load_calibration
 from slam.config import SystemConfig
 from slam.errors import SlamError
-from slam.files import noting_inputs, read_object
+from slam.files import noting_inputs
 from slam.outputs import Output
 from slam.run.outputs import NAMES
 
 _MOST_FRAMES = 10**12  # of a sequence: more than any has
-CONFIG = "config.json"
 _NO_FILES = ("synthetic:", "camera:")
 _PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
 
@@ -79,7 +77,7 @@ def parse_frames(text: str | None) -> tuple[int, int | None]:
 def origin(options: RunOptions) -> dict[str, Any]:
     """What ``config.json`` says besides names: the command, frames, settings, versions, and files by absolute path."""
     run = {"command": options.command, "frames": [options.start, options.stop], "versions": versions()}
-    run["settings"] = _portable(options.config.to_json())
+    run["settings"] = options.config.to_json()
     if not options.source:  # of a recording, or a sequence made in Python
         return run
     files = {"prior_map": options.prior_map, "calibration": options.calibration}
@@ -91,39 +89,6 @@ def origin(options: RunOptions) -> dict[str, Any]:
         "mono": options.mono,
         **{key: file and _place(str(file)) for key, file in files.items()},
     }
-
-
-def load(
-    path: Path, source: str | None = None, prior_map: Path | None = None, calibration: Path | None = None
-) -> tuple[RunOptions, dict[str, str]]:
-    """Read the ``config.json`` of a run: its options, and the versions that it was made with.
-
-    `path` is the file, or the run's folder; the others are taken in place of the run's own. The sequence is where it is
-    found now; empty where it is not known. Raises SlamError where it cannot be read, is none of a run of a sequence, or
-    a file of its is not found any more, and ConfigurationError where its settings are not those of this version.
-    """
-    file = path / CONFIG if os.path.isdir(path) else path  # noqa: PTH112 unlike Path's, without errors
-    try:
-        tree = _restored(read_object(file))
-        if str(tree.get("command", "")).startswith("slam replay"):
-            raise SlamError(f"{file}: that of a replay; repeat it with: {tree['command']}")
-        start, stop = tree["frames"]
-        files = {"source": source, "prior_map": prior_map, "calibration": calibration}
-        places = {key: str(given or tree.get(key) or "") for key, given in files.items()}
-        for key, place in places.items():
-            there = place.startswith(_NO_FILES) or any(map(os.path.exists, (place, place.rpartition("?")[0])))
-            if place and not (files[key] or there or tree.get("source_format") in ("synthetic", "camera")):
-                raise SlamError(f"{file}: {place} is no longer there: give its new place beside --config")
-        options = RunOptions(
-            str(tree["backend"]), str(tree["frontend"]), SystemConfig.from_json(tree["settings"]), Path(), int(start),
-            None if stop is None else int(stop), mono=bool(tree.get("mono", False)), source=places["source"],
-            format=tree.get("source_format"), kind=str(tree.get("kind", "handheld")),
-            prior_map=Path(places["prior_map"]) if places["prior_map"] else None,
-            calibration=Path(places["calibration"]) if places["calibration"] else None,
-        )  # fmt: skip
-        return options, dict(tree.get("versions", {}))
-    except (OSError, ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
-        raise SlamError(f"{file}: not the config.json of a run: {error!r}") from error
 
 
 def versions() -> dict[str, str]:
@@ -140,26 +105,6 @@ def versions() -> dict[str, str]:
 def changed_versions(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """What differs between two sets of versions, in words."""
     return [f"{name} {old}, now {now.get(name)}" for name, old in then.items() if now.get(name) != old]
-
-
-def _portable(tree: Any) -> Any:
-    """The tree with infinite numbers, which JSON does not have, as ``"Infinity"`` and ``"-Infinity"``."""
-    if isinstance(tree, Mapping):
-        return {key: _portable(value) for key, value in tree.items()}
-    if isinstance(tree, (list, tuple)):
-        return [_portable(value) for value in tree]
-    if isinstance(tree, float) and math.isinf(tree):
-        return "Infinity" if tree > 0 else "-Infinity"
-    return tree
-
-
-def _restored(tree: Any) -> Any:
-    """The inverse of `_portable`."""
-    if isinstance(tree, dict):
-        return {key: _restored(value) for key, value in tree.items()}
-    if isinstance(tree, list):
-        return [_restored(value) for value in tree]
-    return float(tree) if tree in ("Infinity", "-Infinity") else tree
 
 
 def _place(text: str) -> str:

@@ -28,9 +28,6 @@ _ASIDE = 1.0  # guard: speed [m/s] at which no vehicle goes sideways
 _FASTEST = {False: 10.0, True: 100.0}
 _NEAREST = {False: 0.05, True: 1.0}
 _WIDEST = {False: 1.0, True: np.inf}  # guard: baseline [m] that no hand carries
-_LAG, _LAG_SIGMAS = 0.1, 5.0  # guard: lag of the right images [frames] that counts, and in standard deviations
-_LEAST_FLOWS = 15  # guard: frames of which a lag is taken
-_FLOW = 4.0  # guard: flow [px] beyond which rows would differ by more than they are matched with
 _MANY = 0.1  # guard: share of frames that were not tracked, from which on it is said
 
 
@@ -175,68 +172,6 @@ def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) 
     return (
         f"from frame to frame the velocity changes {ratio:.0f} times as much as expected: check the times of the "
         f"images (fps=…, or seconds in times=…){'' if driving else ', and whether this is a vehicle (--kind driving)'}"
-    )
-
-
-def row_points(features: StereoFeatures, rig: StereoRig) -> Array:
-    """Of each feature with a right pixel (N, 5): its point in the rectified left camera's axes [m], row, and disparity.
-
-    The row [px] is that in the rectified left image, the disparity [px] the vertical one. Not a number where the rays
-    do not meet.
-    """
-    rows, rectified = np.flatnonzero(features.has_stereo), rig.rectified
-    left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
-    with np.errstate(all="ignore"):
-        points = rectified.rig.triangulate(left, np.column_stack([right[:, 0], left[:, 1]]))
-    return np.column_stack([points, left[:, 1], right[:, 1] - left[:, 1]])
-
-
-def row_flow(seen: Array, T_other_now: Array, rig: StereoRig) -> Array:
-    """Sums of products (7, 7) over `row_points` [px²]: of vertical disparities, of the flow, and of `_fields`.
-
-    The flow is how many rows a still point moves in the left image from another frame to this one; `T_other_now` (4, 4)
-    takes this frame's camera coordinates to the other's. A right image from between them is off by a share of it.
-    """
-    points, R, camera = seen[:, :3], rig.rectified.R_left, rig.rectified.rig.left
-    with np.errstate(all="ignore"):
-        there = (points @ R @ T_other_now[:3, :3].T + T_other_now[:3, 3]) @ R.T
-        flow = seen[:, 3] - camera.project(there)[:, 1]
-        columns = np.column_stack([seen[:, 4], flow, *_fields(points)])
-    columns = columns[np.isfinite(columns).all(axis=1) & (np.abs(flow) < _FLOW)]
-    return np.asarray(columns.T @ columns)
-
-
-def _fields(points: Array) -> tuple[Array, ...]:
-    """How vertical disparities (N,) of points in the camera's axes may be off by the calibration, up to factors.
-
-    A right camera that is turned by a small angle, of another focal length or principal point, or higher or lower.
-    """
-    x, y, z = points.T
-    x, y, one = x / z, y / z, np.ones(len(points))
-    return one, x, y, x * y, one / z
-
-
-def moment_doubt(record: RunRecord) -> str:
-    """What to say where rows of left and right features differ as they do between images of two moments.
-
-    The lag of the right images, in frames, is the regression of vertical disparities on the flow along columns from the
-    frame before; how early they are, on that from the frame after. What errors of the calibration explain, which are
-    the same in all frames, is taken out of both first: a camera that drives straight on moves rows in one way, too.
-    """
-    found = {"": _LAG}
-    for word, sums in zip(("late", "early"), np.array(record.row_flows).reshape(-1, 2, 7, 7).swapaxes(0, 1)):
-        while len(sums) >= _LEAST_FLOWS:  # of all frames, of the last half, … : an image may be missing in the middle
-            whole = sums.sum(axis=0)
-            less = np.concatenate([np.eye(2), -np.linalg.lstsq(whole[2:, 2:], whole[2:, :2], rcond=None)[0]])
-            products, squares = (less.T @ sums @ less)[:, :, 1].T
-            lag = -products.sum() / max(squares.sum(), np.finfo(float).tiny)
-            if lag * squares.sum() > _LAG_SIGMAS * np.sqrt(np.square(products + lag * squares).sum()):
-                found[word] = max(lag, found.get(word, 0.0))
-            sums = sums[len(sums) // 2 :]
-    word = max(found, key=lambda word: found[word])
-    return word and (
-        "left and right image are not of one moment: rows of their features differ with the motion, as if right images "
-        f"were {word} by a part of a frame or more; pair them by their times, and let one camera trigger the other"
     )
 
 

@@ -54,7 +54,8 @@ _METADATA: dict[str, dict[str, Any]] = {
 _BACKENDS = {"ekf": "#0d47a1", "smoother": "#ef6c00", "batch": "#6a1b9a", "window": "#26c6da", "iekf": "#ad1457"}
 _OTHERS = ("#2e7d32", "#c62828", "#5d4037", "#9e9d24")
 _TRUTH, _BEFORE, _NOT_NOW, _NOW = "0.3", "0.8", "#9fa8da", "#283593"
-_LOOPS = ("o", "k", "loops closed"), ("x", "#c62828", "loops refused")
+_DOUBT = "#c62828"
+_LOOPS = ("o", "k", "loops closed"), ("x", _DOUBT, "loops refused")
 _NAME = 2.0  # [in] room for a mark and its name
 _SIGMAS = 2.0  # size of ellipses
 _DECADES = 2.5  # of errors, at most: smaller ones are where an error changes its sign
@@ -151,7 +152,8 @@ def drawn(runs: Sequence[RunData], kind: str) -> Figure:
         if "time" in panels:
             draw_times(panels["time"], runs)
         if head:
-            figure.suptitle(head, x=0.01, ha="left")
+            doubted = any(run.summary.get("doubt") for run in runs)
+            figure.suptitle(head, x=0.01, ha="left", color=_DOUBT if doubted else "k")
     return figure
 
 
@@ -258,11 +260,12 @@ def _draw_map(axis: Axes, run: RunData, colour: str) -> Array:
     for body, positions in run.bodies.items():
         rgb = np.array(body_colour(int(body))) / 255
         axis.plot(*positions[:, [0, 2]].T, "-s", ms=5, lw=1.5, markevery=[-1], color=rgb, label=f"body {body}")
+    paths = [run.online.positions, run.final.positions, *run.bodies.values()]
     if run.truth is not None:
-        axis.plot(*transform(place_of_truth(run), run.truth.positions)[:, [0, 2]].T, "--", color=_TRUTH, lw=1.0,
-                  label="true path")  # fmt: skip
+        paths.append(transform(place_of_truth(run), run.truth.positions))
+        axis.plot(*paths[-1][:, [0, 2]].T, "--", color=_TRUTH, lw=1.0, label="true path")
     near = np.linalg.norm(run.old - run.centre, axis=1) < run.reach
-    points = np.concatenate([run.positions[known], run.online.positions, run.final.positions, run.old[near]])[:, [0, 2]]
+    points = np.concatenate([run.positions[known], *paths, run.old[near]])[:, [0, 2]]
     around = np.zeros_like(points)
     around[: len(known)] = _SIGMAS * np.sqrt(np.diagonal(run.covariances[known], axis1=1, axis2=2)[:, [0, 2]])
     low, high = (points - around).min(axis=0), (points + around).max(axis=0)
@@ -298,6 +301,8 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
             top = (2.0 if k or len(runs) == 1 else 6.0) * float(values.max())  # room for a legend
             bottom = max(0.7 * float(values.min()), top * 10.0**-_DECADES)
             axis.set_ylim(bottom, top)
+            for line in axis.lines:  # a curve ends at the axis
+                line.set_ydata(np.clip(line.get_ydata(), bottom, top))
             axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if top < 100 * bottom else (1,)))
             axis.yaxis.set_major_formatter("{x:g}")
             axis.yaxis.set_minor_formatter("")

@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from slam.calibration.model import Revision, RigCorrection, RigModel
-from slam.checks import FARTHEST_PIXEL, LATEST_STAMP, MOST_ID
+from slam.checks import LATEST_STAMP, MOST_ID
 from slam.data import FrameResult, IdArray, Observations
 from slam.errors import MeasurementError, SequenceError, SlamError
 from slam.files import array, json_text, read_bytes, unpack, whole_file
@@ -225,12 +225,8 @@ class Recording:
 
 
 def _require_fits(frame: RecordedFrame, known: set[int]) -> set[int]:
-    """Raise where pixels or ids are none, or a frame does not fit the map before it; the map after it."""
-    for what, rows in (("observed", frame.observed), ("added", frame.added)):
-        if not np.isfinite(rows.uv_left).all():
-            raise MeasurementError(f"recording: a left pixel of {what} is not finite")
-        if (np.abs(rows.uv_left) > FARTHEST_PIXEL).any() or (np.abs(rows.uv_right) > FARTHEST_PIXEL).any():
-            raise MeasurementError(f"recording: a pixel of {what} is far outside of any image")
+    """Raise where ids are none, or a frame does not fit the map before it; the map after it."""
+    for rows in (frame.observed, frame.added):
         if len(rows) and (rows.ids.min() < 0 or rows.ids.max() > MOST_ID):
             raise MeasurementError(f"recording: ids of landmarks must go from 0 to {MOST_ID}")
     seen, new, gone = (set(ids.tolist()) for ids in (frame.observed.ids, frame.added.ids, frame.removed))

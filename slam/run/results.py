@@ -60,10 +60,14 @@ def number(value: float, like: float | None = None) -> str:
     return text.replace("-", "−")
 
 
+#: Whether a run's path cannot be trusted.
+DOUBTED = "doubted"
+
 #: In the order of all tables. Times are not compared: they differ from run to run.
 METRICS = (
     Metric("completed", "runs completed", "%", "", "higher", "compared main"),
     Metric("tracked", "frames tracked", "%", "", "higher", "compared main"),
+    Metric(DOUBTED, "runs not to be trusted", "%", "", "lower", "compared main"),
     Metric("path_m", "path length", "m", "path_length_m", shown="run picture"),
     Metric("speed", "speed, median", "m/s", "speed_m_per_s", shown="run picture"),
     Metric("landmarks", "landmarks in the map at the end", "", "landmarks", shown="run"),
@@ -89,7 +93,6 @@ METRICS = (
            "lower"),
     Metric("segment_percent", "drift by distance (RPE)", "%", "accuracy/online/segment error [%]", "lower",
            "compared run"),
-    Metric("scale_error_percent", "scale error", "%", "consistency/scale error [%]", "lower"),
     Metric("sigma_m", "claimed σ of the last position", "mm", "final_sigma_m", shown="run picture"),
     Metric("ratio", "errors over claimed σ (1 is right)", shown="run"),
     Metric("nees_10m_per_dof", "NEES / 6 over 10 m (1 is right)", "", "consistency/NEES over 10 m", "one",
@@ -137,10 +140,9 @@ def figures(summary: Mapping[str, Any]) -> dict[str, float]:
         few = (honest.get(f"no covariance {_NEES.get(m.key)}") or 0.0) > _FEW
         if known and not few and (bodies or "moving" not in m.key):  # what is found of nothing is no figure
             found[m.key] = float(np.mean(known)) / (6 if "nees" in m.key else 1)
-    if "scale_error_percent" in found:
-        found["scale_error_percent"] = abs(found["scale_error_percent"])
     if frames := summary.get("frames", 0):
         found["tracked"] = _measured(summary) / frames
+    found[DOUBTED] = float(bool(summary.get("doubt")))
     if ratios := _ratios(found):
         found["ratio"] = next(iter(ratios.values()))
     if not (summary.get("status") or {}).get("tracked"):  # loops of poses that are the motion model's are none

@@ -16,7 +16,7 @@ from slam.evaluation.metrics import align, associate
 from slam.evaluation.summary import rotation_errors
 from slam.evaluation.truth_error import interpolated, truth_covariances
 from slam.files import read_object, read_text
-from slam.geometry.se3 import Array, adjoint, hat, inverse, so3_exp, transform
+from slam.geometry.se3 import Array, adjoint, inverse, transform
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.naming import printable
 from slam.run.schema import OLD_LANDMARKS, STAGES
@@ -152,24 +152,13 @@ def _paired(run: RunData) -> tuple[Trajectory, Trajectory]:
 def place_of_truth(run: RunData) -> Array:
     """Pose (4, 4) of the true path's world in the run's, in which both paths begin at the same position.
 
-    It is turned by the first pose. A recorded one is turned a little further, so that the whole paths fit: an error of
-    its first orientation by some tenths of a degree would look like an error of the path that grows with the distance.
-    What the paths do not tell, such as a turn about a straight path, stays as it was. Where no little turn makes them
-    fit, the truth's orientations are in other axes, and the paths alone count.
+    An exact one is turned by the first pose. A recorded one is turned so that the whole paths fit: an error of its
+    first orientation by some tenths of a degree would look like an error of the path that grows with the distance.
     """
     own, true = _paired(run)
-    T, turn = np.eye(4), own.poses[0, :3, :3] @ true.poses[0, :3, :3].T
-    T[:3, :3] = turn
+    T = own.poses[0] @ inverse(true.poses[0])
     if not run.truth_is_exact:
-        places, true_places = (path.positions - path.positions[0] for path in (own, true))
-        turned = true_places @ turn.T
-        J = -hat(turned).reshape(-1, 3)
-        prior = float(np.mean((places - turned) ** 2)) / _TURNED**2
-        little = np.linalg.solve(J.T @ J + max(prior, 1e-12) * np.eye(3), J.T @ (places - turned).ravel())
-        fitted, by_paths = so3_exp(little) @ turn, align(true, own).R
-        left, least = (float(((places - true_places @ R.T) ** 2).sum()) for R in (fitted, by_paths))
-        fits = left <= 2 * least or left <= float(np.sum(places**2)) * _TURNED**2
-        T[:3, :3] = fitted if fits else by_paths
+        T[:3, :3] = align(true, own).R
     T[:3, 3] = own.positions[0] - T[:3, :3] @ true.positions[0]
     return T
 

@@ -17,13 +17,12 @@ from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError, one_line, text_of
 from slam.evaluation.objects import labels_in_images, score_for
 from slam.evaluation.summary import with_truth
-from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.input.features import Rectification
 from slam.interfaces import Frontend
 from slam.outputs import require_outputs
 from slam.run.options import RunOptions, origin, versions
-from slam.run.outcome import median_depth, moment_doubt, motion_doubt, outcome, row_flow, row_points, scale_doubt
+from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
 from slam.run.outputs import RunFiles, write_json, write_trajectory
 from slam.run.recording import RecordedFrame, Recording, save_recording
 from slam.run.replay import replay
@@ -145,7 +144,6 @@ class _Run:
                 reading[frame.index] = 1e3 * (time.perf_counter() - start) if self.live is None else 0.0
                 yield frame
 
-        before: tuple[FrameResult, Array] | None = None
         for frame, result in system.run(timed()):
             result.milliseconds["read"] = reading.pop(frame.index)  # type: ignore[index]
             if self.live is not None:
@@ -153,11 +151,6 @@ class _Run:
             if frame.right is None:
                 record.without_right.append(len(record.statuses))
             record.depths.append(median_depth(result.features, system.rig))
-            seen, rig = row_points(result.features, system.rig), system.rig
-            if result.status.measured and before is not None and before[0].status.measured:
-                step = inverse(before[0].estimate.T_world_left) @ result.estimate.T_world_left
-                record.row_flows.append((row_flow(seen, step, rig), row_flow(before[1], inverse(step), rig)))
-            before = result, seen
             yield frame.index, result
             for watch in watches:
                 watch(frame, result, system)
@@ -269,8 +262,7 @@ class _Run:
         """The part of the summary on the tracking, which is known of every run."""
         options, record, rig = self.options, self.record, self.sequence.rig
         warnings, driving = getattr(self.system, "warnings", ()), options.kind == "driving"
-        calibration = getattr(self.system, "calibration", None)
-        no_path = scale_doubt(record, rig, driving) or moment_doubt(record) or getattr(calibration, "doubt", "")
+        no_path = scale_doubt(record, rig, driving)
         doubt = no_path or motion_doubt(record, options.config.models.motion, driving)
         in_map, dropped = options.prior_map is not None, self.live.dropped if self.live else 0
         own = options.backend if ":" in options.backend else ""

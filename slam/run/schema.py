@@ -127,7 +127,7 @@ FILES = {
     OLD_LANDMARKS: "a row per landmark that had left the map by then, where the last keyframe that saw it has it",
     "objects.csv": "a row per frame and moving body",
     "summary.json": "counts, accuracy and consistency where the truth is known, timings; written last",
-    "config.json": "what was run, with all settings; `slam run --config` repeats it",
+    "config.json": "what was run: the command, with all settings",
     "schema.json": "columns with units and meanings",
     "summary.png": "a picture of the run",
 }

@@ -53,7 +53,7 @@ def settings() -> Iterator[Setting]:
 
 def _options_of(section: str, name: str) -> Iterator[Setting]:
     """Options that a user can set of a front end (`section` is ``"frontend"``) or back end by its name."""
-    known = registry.options_of(registry.resolve(f"{section}s", name), _RIG) or {}
+    known = registry.options_of(registry.resolve(f"{section}s", name), _RIG)
     for option, (default, described) in known.items():
         key = f"{section}.{option}"
         if can_be_set(key, name):

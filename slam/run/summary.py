@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -26,6 +27,8 @@ from slam.system import StereoSlam
 from slam.third_party import checked, named_failures
 from slam.tracks.step import HIDDEN
 
+logger = logging.getLogger("slam.run")
+
 
 @dataclass(eq=False)
 class RunRecord:
@@ -46,8 +49,6 @@ class RunRecord:
     features: list[tuple[int, int]] = field(default_factory=list)  # number of them, and of those with a right pixel
     without_right: list[int] = field(default_factory=list)  # rows of frames without a right image
     depths: list[float] = field(default_factory=list)  # median of what each frame sees [m]
-    # of pairs of tracked frames, see `row_flow`: of the second one from the first, of the first one from the second
-    row_flows: list[tuple[Array, Array]] = field(default_factory=list)
     bodies: set[int] = field(default_factory=set)
     seen: Counter[int] = field(default_factory=Counter)  # number of frames in which each landmark was measured
     last_seen: dict[int, int] = field(default_factory=dict)  # number of the last of them
@@ -121,6 +122,10 @@ def results_of(
 ) -> dict[str, Any]:
     """The part of a summary that says how good the run was; frames whose pose was not measured are in no error."""
     measured, path = np.array(record.measured), record.trajectory
+    if missing := int((~np.isin(path.stamps, final.stamps)).sum()) if len(final) else 0:
+        logger.warning(
+            "the back end's trajectory() lacks %d of %d frames: it needs a pose for each", missing, len(path)
+        )
     online, steps = path.select(measured), np.diff(path.positions, axis=0)
     speeds = np.linalg.norm(steps, axis=1) / np.diff(path.stamps)
     common = [record.common[row] for row in np.flatnonzero(measured)]

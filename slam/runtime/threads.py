@@ -14,7 +14,6 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import lru_cache, wraps
 from threading import RLock
 from typing import Any, TypeVar
-from weakref import WeakSet
 
 from threadpoolctl import LibController, ThreadpoolController
 
@@ -45,60 +44,35 @@ def _set(library: LibController, threads: int) -> None:
     clear(force=True)
 
 
-class _Call:
-    """A call that is under way."""
-
-    def __init__(self) -> None:
-        self.before: list[tuple[LibController, int]] = []  # numbers of this thread, which other threads cannot set back
-
-
-class _Limit:
-    """The number of BLAS threads is 1 as long as any thread is inside; the last one out sets back what was changed.
-
-    Calls that an interrupt ended on their way in or out leave a token, which goes with them, and numbers that the next
-    call sets back.
-    """
-
-    def __init__(self) -> None:
-        self._inside: WeakSet[_Call] = WeakSet()
-        self._before: list[tuple[LibController, int]] = []
-
-    def enter(self, call: _Call) -> None:
-        for library in _blas(len(sys.modules)):
-            threads = library.get_num_threads()
-            if threads != 1:
-                of_thread = getattr(library, "threading_layer", "") == "openmp"
-                (call.before if of_thread else self._before).append((library, threads))
-                _set(library, 1)
-        self._inside.add(call)
-
-    def leave(self, call: _Call) -> None:
-        self._inside.discard(call)
-        for before in (call.before, [] if self._inside else self._before):
-            while before:
-                _set(*before[-1])
-                before.pop()
-
-
-_limit, _lock = _Limit(), RLock()
+_lock = RLock()
+_inside: set[object] = set()  # a token of each call that is under way
+_before: list[tuple[LibController, int]] = []  # what the last one out sets back
 
 
 def one_blas_thread(function: _F) -> _F:
-    """Run with one BLAS thread, in whatever thread of Python's.
+    """Run with one BLAS thread, in whatever thread of Python's; the last of several calls out sets back what was.
 
     As ``ThreadpoolController.limit``, but that only works in the thread that used it first, and costs twenty
-    microseconds where there is one thread already. What is done with the lock stands on the lock's own line: an
-    interrupt comes before it or within, where the lock is given back, but not between the end of a block and that.
+    microseconds where there is one thread already.
     """
 
     @wraps(function)
     def limited(*args: Any, **kwargs: Any) -> Any:
-        call = _Call()
+        call = object()
         try:
-            with _lock: _limit.enter(call)  # noqa: E701  # fmt: skip
+            with _lock:
+                _inside.add(call)
+                for library in _blas(len(sys.modules)):
+                    if (threads := library.get_num_threads()) != 1:
+                        _before.append((library, threads))
+                        _set(library, 1)
             return function(*args, **kwargs)
         finally:
-            with _lock: _limit.leave(call)  # noqa: E701  # fmt: skip
+            with _lock:
+                _inside.discard(call)
+                while _before and not _inside:
+                    _set(*_before[-1])
+                    _before.pop()
 
     return limited  # type: ignore[return-value]
 

@@ -14,23 +14,17 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
-from slam.errors import ConfigurationError, SequenceError, SlamError, UnknownNameError
-from slam.files import expanded, note_input, read_object, reason
+from slam.errors import ConfigurationError, SequenceError, UnknownNameError
+from slam.files import expanded, note_input, reason
 from slam.naming import nearest, unknown
 from slam.sequences import euroc, folders, kitti, ros
-from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, read_masks, say, turned
+from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, logger, read_masks, turned
 from slam.sequences.folders import VIDEO_SUFFIXES
 from slam.sequences.images import IMAGE_SUFFIXES
 from slam.sequences.options import RECORDED, Options, read_options
 
 __all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
 
-#: What to do with files that are no sequence, by their endings.
-_HINTS = {
-    **dict.fromkeys((".zip", ".7z", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".lz4"), "unpack it first"),
-    **dict.fromkeys((".svo", ".svo2"), "export it as a video of both images side by side"),
-    **dict.fromkeys(IMAGE_SUFFIXES, "give the folder that holds both cameras' images"),
-}
 _LOOKED_AT = 500  # entries below a folder that is no sequence, at each of so many levels
 _LEVELS = 4
 _LISTED = 6  # sequences below a folder
@@ -121,7 +115,7 @@ def _open_folder(text: str, format: str | None) -> RecordedSequence:
         swap = options.get("swap", False)
         options.require_read(f"{folder} is read as {name}")
     for line in lines:
-        say(line)
+        logger.warning("%s", line)
     truth = turned(found.ground_truth, found.rig)
     return replace(found, ground_truth=truth, masks=masks, swap=swap, warnings=lines)
 
@@ -169,11 +163,10 @@ def _format_asked(folder: Path, query: str, text: str) -> str | None:
         return "ros"
     if not folder.exists():
         what = "file or folder" if folder.suffix else "folder"
-        raise SequenceError(f"{folder}: there is no such {what}{_hint_name(folder, text)}")
+        raise SequenceError(f"{folder}: there is no such {what}{_hint_name(text)}")
     if not folder.is_dir() and "layout" not in named:
-        ending = folder.suffix.lower()
-        hint = f"; {_HINTS[ending]}" if ending in _HINTS else _hint_run(folder.parent)
-        if ending in VIDEO_SUFFIXES:
+        hint = "; give the folder that holds both cameras' images, unpacked"
+        if folder.suffix.lower() in VIDEO_SUFFIXES:
             two = f"two are {folder.parent}?left=…&right=…"
             hint = f"; a video with both images side by side is {folder}?layout=sbs, {two}"
         raise SequenceError(f"{folder}: a file where the sequence's folder should be{hint}")
@@ -182,31 +175,17 @@ def _format_asked(folder: Path, query: str, text: str) -> str | None:
     return "folders" if named & {"left", "right", "layout"} else _format_of(folder)
 
 
-def _hint_name(folder: Path, text: str) -> str:
-    """A world with a similar name, or the part of the path that is missing first; `text` was asked for."""
+def _hint_name(text: str) -> str:
+    """A world with a similar name than what was asked for."""
     from slam import worlds
 
     name, mark, query = text.partition("?")
-    near = None if Path(name).name != name else nearest(name, worlds.names())
-    if near:
-        return f" (did you mean 'synthetic:{near}{mark}{query}'?)"
-    there = next((parent for parent in folder.parents if parent.is_dir()), folder.parent)
-    return "" if there == folder.parent else f": {there} has no {folder.relative_to(there).parts[0]!r}"
-
-
-def _hint_run(folder: Path) -> str:
-    """What a folder that a run left was a run of, and what shows it."""
-    with suppress(SlamError):
-        if (folder / "frames.csv").is_file():
-            source = read_object(folder / "config.json").get("source") or "something"
-            return f"; it is what a run of {source} left: give that, or look at the run with `slam view {folder}`"
-    return ""
+    near = nearest(name, worlds.names())
+    return f" (did you mean 'synthetic:{near}{mark}{query}'?)" if near else ""
 
 
 def _hint_near(folder: Path) -> str:
     """Which sequences lie below a folder, or it is a part of; else how to name the two cameras in it."""
-    if run := _hint_run(folder):
-        return run
     with suppress(OSError, SequenceError):
         for level in range(1, _LEVELS + 1):  # 2011_09_26/…_sync, dataset/sequences/03
             inside = islice(folder.glob("/".join("*" * level)), _LOOKED_AT)

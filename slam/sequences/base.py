@@ -6,7 +6,6 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -79,23 +78,15 @@ def is_live(frames: object) -> bool:
 #: So many faults of one kind are reported one by one; the others are counted.
 _LINES_PER_KIND = 5
 
-_silent: ContextVar[bool] = ContextVar("whether lines are kept, but not logged", default=False)
-
 
 @contextmanager
 def said_before() -> Iterator[None]:
     """For opening a sequence once more: what its files lack was logged the first time, and is only kept."""
-    token = _silent.set(True)
+    before, logger.disabled = logger.disabled, True
     try:
         yield
     finally:
-        _silent.reset(token)
-
-
-def say(line: str) -> None:
-    """Log a fault, unless it was said before."""
-    if not _silent.get():
-        logger.warning("%s", line)
+        logger.disabled = before
 
 
 class FaultLog:
@@ -120,7 +111,7 @@ class FaultLog:
         if line not in self._lines:
             self._lines.append(line)
         if not self._quiet:
-            say(line)
+            logger.warning("%s", line)
 
     def __enter__(self) -> FaultLog:
         return self

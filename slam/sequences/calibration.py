@@ -30,7 +30,7 @@ _SPELLINGS: dict[str, tuple[str, ...]] = {
           "distortioncoeff", "coeffs"),
     "P": ("p", "projectionmatrix", "projection"),
     "R_rect": ("r", "rectificationmatrix"),
-    "T_BS": ("tbs", "timucam", "bodyt"),
+    "T_BS": ("tbs", "timucam"),
     "T_cam_imu": ("tcamimu",),
     "R": ("r", "rot", "om", "rotation", "rotationmatrix", "stereor", "rstereo"),
     "T": ("t", "trans", "translation", "translationvector", "stereot", "tstereo"),
@@ -49,8 +49,7 @@ _SPELLINGS: dict[str, tuple[str, ...]] = {
     "distortion model": ("distortionmodel",),
     "camera model": ("cameramodel", "model", "cameratype", "modeltype"),
 }  # fmt: skip
-_GROUPS = ("stereorectifier", "extrinsics", "extrinsic", "intrinsics", "intrinsic", "parameters",
-           "projectionparameters", "distortionparameters")  # of entries, whose names say nothing  # fmt: skip
+_GROUPS = ("stereorectifier", "extrinsics", "extrinsic", "intrinsics", "intrinsic", "parameters")  # names say nothing
 _OF_ONE = ("tbs", "cameramatrix", "projectionmatrix", "p")  # names that a file of one camera has
 _FROM_ZERO = ("k0", "m0", "d0", "p0", "cameramatrix0", "camera0fx")  # one of these: cameras are counted from 0
 
@@ -61,7 +60,6 @@ _FORMS = {
     "ROS's": ("leftcameramatrix", "leftp"),
     "ORB-SLAM's": ("camerabf", "stereotc1c2", "stereob", "camera1fx"),
     "stella_vslam's": ("camerafocalxbaseline",),
-    "VINS-Fusion's": ("bodytcam0",),
 }
 _COMPLETE = "K1, D1, K2, D2, R and T; one of rectified images P1 and P2, or fx, fy, cx, cy and baseline"
 
@@ -197,9 +195,6 @@ def _read(path: Path, images: Size | None, cameras: tuple[str, str]) -> tuple[Ma
             raise CalibrationError(what)
         if "cameraData" in root:
             return _read_depthai(root), "depthai's"
-    files = [path.parent / str(root.get(f"cam{side}_calib", "")) for side in (0, 1)]
-    if all(file.is_file() for file in files):  # VINS-Fusion's, with a file for each camera
-        root = {**root, "left": read_yaml(files[0]), "right": read_yaml(files[1])}
     return root, ""
 
 

@@ -20,7 +20,7 @@ from slam.sequences.images import both, grabbed_image, quiet_libraries, recorded
 from slam.sequences.options import CALIBRATION, Options, read_options
 from slam.sequences.rigs import calibration_files, read_rig
 
-OPTIONS = CALIBRATION | {"left", "right", "width", "height", "fps", "wait"}
+OPTIONS = CALIBRATION | {"width", "height", "fps", "wait"}
 
 #: How long frames are waited for where a camera gives none [s].
 WAIT = 10.0
@@ -46,8 +46,7 @@ class CameraSequence:
     again and again for a while; one that stays silent ends the sequence with an error. `frames` opens it anew: images
     that waited in a queue until then are old.
 
-    Its text is the address, or two joined by a comma, see `open_device`; empty where the options ``left`` and ``right``
-    name them.
+    Its text is the address, or two joined by a comma, see `open_device`.
 
     Raises:
         SequenceError: a camera cannot be opened, gives no image, or one of another size than the calibration is for.
@@ -61,10 +60,6 @@ class CameraSequence:
 
     def __init__(self, text: str, options: Mapping[str, Any]) -> None:
         addresses = [text] if "!" in text else [part.strip() for part in text.split(",")]
-        if "left" in options or "right" in options:
-            if text or not ("left" in options and "right" in options):
-                raise ConfigurationError("camera: name both left=… and right=…, and no other address")
-            addresses = [options["left"], options["right"]]
         if len(addresses) > 2 or not all(addresses):
             hint = "name one device with both images side by side (camera:0), or two (camera:0,1)"
             raise ConfigurationError(f"camera: {hint}")

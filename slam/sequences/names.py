@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import pairwise
 from statistics import median
 
 import numpy as np
@@ -23,22 +23,23 @@ SIDES = (
 _MOST_FRAMES = 10**12  # numbers of frames go up to this: as floating-point numbers they are still told apart
 _SHORTEST = 10**6  # [ns] between frames: no camera is faster, and no count of frames has such steps
 _LONGEST = 10**11  # [ns] between frames: a hundred seconds
-_SPARSE = 10  # guard: largest step of a count behind seconds, of which every so many frames were kept
 _SHORTEST_MICRO = 10**4  # [µs] between frames: a hundred a second; no count of frames has such steps, either
 
-_DATE = re.compile(
-    r"(?<!\d)(20\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[-_T ]?([0-2]\d)[-_:.h]?([0-5]\d)[-_:.m]?([0-5]\d)"
-    r"(?:[-_.s]?(?!20\d\d[-_.]?[01]\d[-_.]?[0-3]\d)(\d{1,9}))?(?!\d)",
-    re.ASCII,
-)
 # Since 1973: seconds with a fraction, nano-, micro-, milliseconds, these with a fraction, too, or whole seconds; or
 # seconds since a start.
 _STAMP = re.compile(
-    r"(?<!\d)(?<!\d[.,])(?:([1-9]\d{8,9})[.,_-](\d{1,9})|([1-9]\d{17,18})|([1-9]\d{15})|([1-9]\d{12}(?:[.,]\d{1,6})?)"
+    r"(?<!\d)(?<!\d[.,])(?:([1-9]\d{8,9})[.,](\d{1,9})|([1-9]\d{17,18})|([1-9]\d{15})|([1-9]\d{12}(?:[.,]\d{1,6})?)"
     r"|([12]\d{9})|(\d{1,10})[.,](\d{1,9}))(?!\d|[.,]\d)",
     re.ASCII,
 )
 _SECONDS = re.compile(r"(-?\d{1,10})[.,](\d{1,9})", re.ASCII)  # a whole name
+_DATE = re.compile(r"(?<!\d)20\d\d[-_.]?[01]\d[-_.]?[0-3]\d(?!\d)", re.ASCII)  # what follows is a time of day
+# A date and time down to milli-, micro- or nanoseconds.
+_MOMENT = re.compile(
+    r"(?<!\d)(20\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[-_T ]?([0-2]\d)[-_:.h]?([0-5]\d)[-_:.m]?([0-5]\d)"
+    r"[-_.s]?(\d{9}|\d{6}|\d{3})(?!\d)",
+    re.ASCII,
+)
 _NUMBER = re.compile(r"\d+", re.ASCII)
 
 
@@ -91,18 +92,19 @@ def keys_of(sides: Sequence[Sequence[str]]) -> Keys | None:
     """What the names of each camera's images say; None where neither stamps nor numbers tell the images apart.
 
     A stamp is 19 digits (nanoseconds), 16 (microseconds), 13 (milliseconds), 10 (seconds), the last two also with a
-    fraction, or a date with the time, anywhere in the names; or numbers so far apart that they cannot count frames. A
-    frame's number is the one that differs from name to name; of several, those that both cameras share, and that count
-    best.
+    fraction, or a date and time with its fraction, anywhere in the names; or numbers so far apart that they cannot
+    count frames. A frame's number is the one that differs from name to name; of several, those that both cameras share,
+    and that count best.
     """
     stems = [[stem(name) for name in names] for names in sides]
-    for read in (_dates, _stamps):
+    for read in (_moments, _stamps):
         keys = [found for own in stems if (found := read(own)) is not None]
-        if len(keys) == len(sides):
-            every = [name for own in stems for name in own]
-            plain = all(_SECONDS.fullmatch(name) or (name.isdecimal() and _STAMP.fullmatch(name)) for name in every)
-            moment = f"{1e-9 * keys[0][0]:.6f} s" + " since 1970" * bool(keys[0][0] >= 10**17)
-            return Keys(keys, True, f"the stamp in {sides[0][0]} is taken as {moment}" if not plain else "")
+        if len(keys) < len(sides):
+            continue
+        every = [name for own in stems for name in own]
+        plain = all(_SECONDS.fullmatch(name) or (name.isdecimal() and _STAMP.fullmatch(name)) for name in every)
+        moment = f"{1e-9 * keys[0][0]:.6f} s" + " since 1970" * bool(keys[0][0] >= 10**17)
+        return Keys(keys, True, f"the stamp in {sides[0][0]} is taken as {moment}" if not plain else "")
     return _numbers(sides)
 
 
@@ -114,7 +116,7 @@ def _stamps(names: Sequence[str]) -> IntArray | None:
         rows = [[("",) * 6 + match.groups()] for name in names if (match := _SECONDS.fullmatch(name))]
     for parts in zip(*rows):
         fractions = [part[1] or part[7] for part in parts]
-        if _counters([part[0] or part[6] for part in parts], fractions):
+        if all(part[6] for part in parts) and any(map(_DATE.search, names)):
             continue
         # Fractions of unequal length have lost zeros at their ends, or those in front: then steps are uneven.
         lengths = {len(fraction) for fraction in fractions}
@@ -130,26 +132,18 @@ def _stamps(names: Sequence[str]) -> IntArray | None:
     return None
 
 
-def _counters(seconds: Sequence[str], digits: Sequence[str]) -> bool:
-    """Whether what stands behind the seconds counts frames, of which a few may be missing, and is no fraction."""
-    if not all(seconds) or not all(digits):
-        return False
-    rows = sorted((int(second), int(counter)) for second, counter in zip(seconds, digits))
-    each = [[counter for _, counter in group] for _, group in groupby(rows, key=lambda row: row[0])]
-    within = Counter(step for own in each for step in _steps(own))
-    step, count = within.most_common(1)[0] if within else (0, 0)
-    if not 1 <= step <= _SPARSE or 4 * count < 3 * within.total():
-        return False
-    width = max(map(len, digits))
-    unpadded = all(str(int(own)) == own for own in digits) and any(own != "0" and own[-1] == "0" for own in digits)
-    if step * 10 ** (9 - width) <= _SHORTEST or (len(set(map(len, digits))) > 1 and unpadded):
-        return True
-    across = [after[0] - before[-1] for before, after in pairwise(each)]
-    if across and min(across) > 0 and 2 * across.count(step) >= len(across):
-        return True
-    whole = all(own == list(range(own[0], own[0] + len(own))) and own[0] <= 1 for own in each)
-    anew = across and step == 1 and 2 * sum(own[0] <= 1 for own in each[1:]) >= len(across)
-    return bool(anew) and max(own[-1] for own in each) < 10**width - (1 if whole else 2)
+def _moments(names: Sequence[str]) -> IntArray | None:
+    """Dates and times [ns since 1970] that every name has and that tell the names apart."""
+    for found in zip(*(_MOMENT.finditer(name) for name in names)):  # the session's may stand before the image's
+        whole = ["{}-{}-{}T{}:{}:{}".format(*match.groups()) for match in found]
+        try:
+            keys = np.array(whole, "datetime64[ns]").astype(np.int64)
+        except ValueError:  # no date
+            continue
+        keys = keys + [int(match[7].ljust(9, "0")) for match in found]
+        if len(set(keys)) == len(names) and median(_steps(keys.tolist()) or [np.inf]) > _SHORTEST:  # else they count
+            return np.asarray(keys)
+    return None
 
 
 def _nanoseconds(part: tuple[str, ...], width: int) -> int:
@@ -160,27 +154,6 @@ def _nanoseconds(part: tuple[str, ...], width: int) -> int:
         return int(seconds or whole) * 10**9 + (-below if seconds.startswith("-") else below)
     whole_milli, _, below_milli = milli.replace(",", ".").partition(".")
     return int(nano) if nano else int(micro) * 10**3 if micro else int(whole_milli + below_milli.ljust(6, "0"))
-
-
-def _dates(names: Sequence[str]) -> IntArray | None:
-    """Dates with the time [ns since 1970] that every name has and that tell the names apart."""
-    for found in zip(*(list(_DATE.finditer(name)) for name in names)):  # the session's may stand before the image's
-        digits = [match[7] or "" for match in found]
-        counters = [int(own or 0) for own in digits]
-        together = len({match.groups()[:6] for match in found}) == 1  # then a few digits count likelier than at 100 Hz
-        steps = _steps(counters) if together else np.diff(counters).tolist()
-        counted = 4 * steps.count(1) >= 3 * len(steps) if together else set(steps) == {1}
-        if steps and (counted or _counters(["".join(match.groups()[:6]) for match in found], digits)):
-            continue
-        moments = ["{}-{}-{}T{}:{}:{}".format(*match.groups()) for match in found]
-        fractions = [int((match[7] or "0").ljust(9, "0")) for match in found]
-        try:
-            keys = np.array(moments, "datetime64[ns]").astype(np.int64) + np.array(fractions)
-        except ValueError:  # no date
-            continue
-        if len(np.unique(keys)) == len(names):
-            return keys
-    return None
 
 
 def _numbers(sides: Sequence[Sequence[str]]) -> Keys | None:

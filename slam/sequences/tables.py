@@ -27,7 +27,7 @@ LARGEST = 4.1e7
 
 _ROTATION = 1e-2  # largest error of an element of RᵀR: files have six digits and more
 _MOST_SECONDS = 1e11  # of a time, either side of zero: in nanoseconds it would not fit into 64 bits long before
-_SLOWEST = 100.0  # [s] between frames, at most, of times in a unit that nobody named
+_SLOWEST, _USUAL = 10.0, 0.05  # [s] between frames: at most, else they are in another unit; by which it is found
 _HEADING = re.compile(r"\D*(time|stamp|\bt\b|\bsec|\b[num]s\b)\D*", re.IGNORECASE)  # a first row that names the columns
 _IMAGE = re.compile(r"\.(png|jpe?g|p[gp]m|bmp|tiff?|webp)$", re.IGNORECASE)
 _DATE_TIME = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", re.ASCII)
@@ -59,7 +59,7 @@ def read_times(path: Path, faults: FaultLog) -> tuple[Array, list[str]]:
     """The times in a file by row [s], NaN for unreadable ones, and the images that its rows name, if all do.
 
     A row's time is its first number, or a date with the time; the second number where the first ones count rows. Times
-    since 1970 in a finer unit are known by their size. SequenceError where a time is impossible.
+    in a finer unit are known by their steps. SequenceError where a time is impossible.
     """
     names: list[str] = []
 
@@ -69,15 +69,15 @@ def read_times(path: Path, faults: FaultLog) -> tuple[Array, list[str]]:
 
     rows = read_rows(path, row, faults)
     times, second = np.array([row or [np.nan, np.nan] for row in rows]).T
-    low, high = SINCE_1970
-    counts = len(times) > 1 and times[0] % 1 == 0 and 0 <= times[0] < low and (np.diff(times) == 1).all()
+    counts = len(times) > 1 and times[0] % 1 == 0 and 0 <= times[0] < SINCE_1970[0] and (np.diff(times) == 1).all()
     if counts and (np.diff(second) > 0).all():
         faults.report("times", f"{path}: the first number of each row counts rows; the second one is taken as time")
         times = second
-    for unit, size in UNITS if len(times) > 1 else ():
-        if low <= np.nanmedian(np.abs(times)) / size <= high and np.nanmedian(np.abs(np.diff(times))) < size * _SLOWEST:
-            faults.report("times", f"{path}: the times are taken as {unit}")
-            times = times / size
+    step = np.median([0.0, *np.abs(np.diff(times[np.isfinite(times)]))])
+    if step > _SLOWEST:  # in the unit in which they are those of a camera
+        unit, size = min(UNITS, key=lambda one: abs(np.log(step / one[1] / _USUAL)))
+        faults.report("times", f"{path}: the times are taken as {unit}")
+        times = times / size
     if (np.abs(times) > _MOST_SECONDS).any():
         raise SequenceError(f"{path}: {times[np.abs(times) > _MOST_SECONDS][0]:g} is no possible time in seconds")
     return np.asarray(times), names if len(set(names)) == len(rows) else []

@@ -13,7 +13,7 @@ from slam.chi_square import chi_square_limit
 from slam.geometry import kernels
 from slam.geometry.arrays import BoolArray, IndexArray, median
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig
-from slam.geometry.se3 import Array, inverse
+from slam.geometry.se3 import Array, inverse, pose
 from slam.window.gating import MIN_CONSENSUS
 from slam.window.problem import Rows, Window
 from slam.window.solver import STEPS, solve
@@ -23,6 +23,7 @@ CLEAR_MAJORITY = 0.7  #: share of the matches that agree with the guess at which
 _BATCH = 10  # cost: hypotheses tried at once
 _ENOUGH = 100  # cost: matches that fix a pose far better than is needed to tell which others agree
 _HYPOTHESES = 200  # cost: poses tried in the search for one on which the landmarks agree
+_CAMERA = np.eye(3)  # fixed: of bearings, not pixels
 _AS_NEW = 2.0  # innovation variance of a landmark as uncertain as a new one, in units of the pixel variance
 
 
@@ -161,12 +162,13 @@ class _Matches:
         import cv2
 
         bearings = (self.z[:, :2] - [self.stereo.u0, self.stereo.v0]) / self.stereo.f
-        poses = []
-        for three in triples:
-            _, turns, shifts = cv2.solveP3P(self.points[three], bearings[three], np.eye(3), None, cv2.SOLVEPNP_P3P)
-            for turn, shift in zip(turns, shifts):
-                T = np.eye(4)
-                T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-                poses.append(inverse(T))
-        found = np.array(poses).reshape(-1, 4, 4)
+        turns: list[Array] = []
+        shifts: list[Array] = []
+        for points, rays in zip(self.points[triples], bearings[triples]):
+            _, some, there = cv2.solveP3P(points, rays, _CAMERA, None, cv2.SOLVEPNP_P3P)
+            turns += [cv2.Rodrigues(turn)[0] for turn in some]
+            shifts += there
+        if not turns:
+            return np.zeros((0, 4, 4))
+        found = inverse(pose(np.array(turns), np.array(shifts)[:, :, 0]))
         return found[np.isfinite(found).all(axis=(1, 2))]

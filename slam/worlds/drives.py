@@ -21,7 +21,6 @@ STEP = 0.5  #: distance between samples of a road [m]
 SAME_ROAD = 5.0  #: a later drive within this distance of a road's middle runs along that road [m]
 _FILE_RATE = 10.0  # of paths without stamps, KITTI's [Hz]
 _SHORTEST, _LONGEST = 10.0, 100_000.0  # of a path [m]
-_LONGEST_STEP = 50.0  # from one pose to the next [m]
 _SMOOTHED = 2.0  # standard deviation of the filter that takes noise off the road's course [m]
 _BEYOND = 60.0  # a road goes on so far behind the path's start and beyond its end [m]
 _TURNED = 25.0  # what lies so much further along the path is another drive along a road, or another road [m]
@@ -54,10 +53,6 @@ def read_path(text: str) -> Trajectory:
     if not _SHORTEST <= length <= _LONGEST:
         limits = f"{_SHORTEST:.0f} m to {_LONGEST / 1000:.0f} km"
         raise SequenceError(f"{file}: a path of {length:.1f} m in {len(path)} poses; a drive needs {limits}")
-    long = np.linalg.norm(steps, axis=1)
-    if long.max() > _LONGEST_STEP:
-        row = int(np.argmax(long)) + 1
-        raise SequenceError(f"{file}: row {row} is {long.max():.0f} m from the one before: no path of a vehicle")
     return path
 
 

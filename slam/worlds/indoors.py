@@ -1,4 +1,4 @@
-"""Worlds within walls: shelves, a desk, a laboratory with boxes, a playing field, a board of signs."""
+"""Worlds within walls: shelves, a desk, a laboratory with boxes, a board of signs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from slam.geometry.se3 import Array, pose
-from slam.worlds.geometry import BACK, DOWN, FORWARD, LEFT, RIGHT, Parts, Rectangle, crate, cuboid, rectangle
+from slam.worlds.geometry import BACK, DOWN, FORWARD, LEFT, RIGHT, Parts, Rectangle, crate, rectangle
 from slam.worlds.paths import camera_poses, carried, clock, placed, sway, through, watching, yaw_pitch_roll
 from slam.worlds.surfaces import Material, Shelves, Signs
 
@@ -243,39 +243,6 @@ def _box_poses(t: Array) -> Array:
     lid = lower.copy()
     lid[:, :3, :3] = lower[:, :3, :3] @ np.array([yaw_pitch_roll(0, 0, -a) for a in opening])
     return np.stack([first, second, third, lower, lid])
-
-
-def field(values: Mapping[str, Any]) -> Parts:
-    """Paper B, 4.3: a small humanoid robot walks from the left to the right side of a playing field."""
-    stamps, t = clock(values, 25.0)
-    layout = values["layout"]
-    rng = np.random.default_rng([layout, 48])
-    offsets, angles = carried(stamps, rng, gait=1.6, amount=1.2)
-    x = through(t, [1.0, 24.0], [-1.5, 1.5])
-    positions = np.stack([x, np.full(len(t), -0.6), np.full(len(t), 0.48)], axis=1) + offsets  # it is 51 cm tall
-    yaw = np.deg2rad(4) * sway(t, rng, 0.05, 0.2) + angles[:, 0]
-    poses = camera_poses(positions, yaw, np.deg2rad(-5) + angles[:, 1], angles[:, 2])
-    hall = [
-        rectangle(Material(6.0, 4.0, "field", layout, 3), (-3.0, 2.0, 0.0), RIGHT, BACK),
-        rectangle(Material(12.0, 9.0, "wood", layout + 1, 1), (-6.0, 4.0, -0.01), RIGHT, BACK),
-        rectangle(Material(12.0, 3.5, "plaster", layout, 0.3), (-6.0, 4.0, 3.4), RIGHT, DOWN),
-    ]
-    rng = np.random.default_rng([layout, 49])
-    for i in range(8):  # advertising boards behind the field
-        board = Material(0.72, 0.5, "poster", int(rng.integers(1 << 30)), 60, (0.03, 0.08))
-        hall.append(rectangle(board, (-3.0 + 0.75 * i, 2.15 + rng.uniform(0, 0.1), 0.5), RIGHT, DOWN, occludes=True))
-    for i in range(7):  # and posters on the hall's wall
-        poster = Material(0.6, 0.8, "poster", int(rng.integers(1 << 30)), 60, (0.03, 0.08))
-        hall.append(rectangle(poster, (-4.2 + 1.2 * i, 3.98, 1.9), RIGHT, DOWN))
-    for across in (-0.75, 0.7):  # the posts of the goal
-        faces = {side: Material(0.05, 0.8, "board", layout) for side in ("front", "left", "right")}
-        hall += cuboid(faces, (0.05, 0.05, 0.8), (across, 1.7, 0))
-    rng = np.random.default_rng([layout, 50])
-    for i, place in enumerate(((-1.6, 0.9), (-0.4, 1.2), (0.5, 0.8), (1.7, 1.1))):  # cartons on the field
-        size, looks = rng.uniform(0.18, 0.32, 3), Material(0, 0, "carton", 1000 * layout + 10 * i, 200, (0.015, 0.04))
-        T = pose(yaw_pitch_roll(rng.uniform(-0.6, 0.6), 0, 0), np.array([*place, 0.0]))
-        hall += crate(size, looks, T_body_box=T, sides=("front", "left", "right", "top"))
-    return Parts(stamps, poses, hall)
 
 
 CAMERA = (0.03, -0.70, 0.027)  #: where the camera stands before the board, whose middle is the world's origin [m]

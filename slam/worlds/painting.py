@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from slam.worlds.brushes import Box, Colour, Page, Rng, Size, clouds, grain, mottled, tinted, wood, words
@@ -123,7 +122,6 @@ def _carton(size: Size, rng: Rng, density: float) -> np.ndarray:
 
 _WALLS = ((150, 190, 215), (120, 140, 185), (190, 205, 215), (110, 120, 150), (160, 175, 180), (120, 165, 200))
 _PAINTS = ((40, 40, 150), (130, 80, 40), (60, 60, 60), (185, 190, 195), (215, 220, 222), (70, 110, 60), (30, 32, 35))
-_LINES = (225.0, 232.0, 228.0)
 
 
 def _paint_facade(house: Facade, density: float) -> np.ndarray:
@@ -223,23 +221,6 @@ def _car_part(size: Size, rng: Rng, density: float, items: tuple[tuple[Box, Colo
     return page.picture
 
 
-def _field(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A robots' playing field: green carpet with white lines."""
-    page = Page(mottled(size, rng, density, (60.0, 125.0, 55.0), (0.09, 0.012, 2), (0.05, 0.3, 3)), rng)
-    (height, width), line, edge = size, 0.05 * density, 0.35 * density
-    for box in (
-        (edge, edge, width - 2 * edge, line),
-        (edge, height - edge, width - 2 * edge, line),
-        (edge, edge, line, height - 2 * edge),
-        (width - edge, edge, line, height - 2 * edge),
-        (width / 2, edge, line, height - 2 * edge),
-    ):
-        page.bar(box, _LINES)
-    centre = round((width / 2 - 0.5) * 16), round((height / 2 - 0.5) * 16)
-    cv2.circle(page.picture, centre, round(0.6 * density * 16), _LINES, max(1, round(line)), cv2.LINE_AA, 4)
-    return page.picture
-
-
 def _fleck(page: Page, x: float, y: float, diameter: float) -> None:
     """A faint round fleck, darker or brighter than what is around it."""
     here = page.picture[min(int(y), page.height - 1), min(int(x), page.width - 1)].astype(float)
@@ -278,7 +259,6 @@ RECIPES = {
     "poster": Recipe(_poster, _print),
     "asphalt": Recipe(_asphalt, _fleck, 0.5),
     **{name: Recipe(partial(_car_part, items=items)) for name, items in _CAR_PARTS.items()},
-    "field": Recipe(_field, _fleck),
 }
 
 PAINTERS: dict[type, Callable[..., np.ndarray]] = {

@@ -68,10 +68,6 @@ SCENES = {
         (4.0, 60.0), 64.0, "driving",
         (Option("path", "", "file of the path: poses in the form of KITTI (at 10 Hz) or TUM"),), _TOWN, True,
     ),
-    "field": Scene(
-        "a robots' playing field, the robot walking from its left to its right side (paper B, section 4.3)",
-        indoors.field, (0.3, 5.0), 500.0, defaults={"density": 60.0},
-    ),
     "people": Scene(
         "a slow drive past parked cars, among cyclists and walkers whose legs swing", traffic.people,
         (4.0, 60.0), 64.0, "driving", defaults=_DRIVING,

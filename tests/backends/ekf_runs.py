@@ -30,9 +30,8 @@ def nees(backend: EkfBackend, truth: np.ndarray) -> float:
 
 def dense(covariance: Covariance) -> np.ndarray:
     """Of camera and landmarks of the state, as one matrix (12 + 3A, 12 + 3A)."""
-    h, b = len(covariance.head), 3 * covariance.parked
-    with_camera = covariance.head[:CAMERA, h + b :]
-    return np.block([[covariance.camera, with_camera], [with_camera.T, covariance.marks[b:, b:]]])
+    kept = np.s_[CAMERA : covariance.begin]
+    return np.delete(np.delete(covariance.P, kept, 0), kept, 1)
 
 
 def halfway(data: Scene, frames: int, models: EstimatorModels = MODELS, **options) -> tuple[EkfBackend, set[int]]:

@@ -14,14 +14,12 @@ from backends.smoother import SmootherBackend
 from backends.smoother.graph import SolverError
 from experiments.simulated_recording import true_recording
 from slam.data import StereoFeatures
-from slam.evaluation.metrics import absolute_errors
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel, models_for
 from slam.run.replay import replay
 from slam.system import StereoSlam
-from slam.tracks.config import MapConfig
 from slam.worlds import open_world
-from tests.backends.scenes import RIG, path, run, scene, step
+from tests.backends.scenes import RIG, path, run, scene
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
 
@@ -42,31 +40,6 @@ def test_without_noise_smoother_and_batch_are_the_truth(world):
         off = np.abs(se3.log(se3.inverse(truth) @ poses))
         # What is left is the pull of the motion prior against measurements of 0.01 px.
         assert off.max() < 1e-6, f"{name}: off by {off.max()}"
-
-
-@pytest.mark.slow
-def test_the_smoother_is_nearly_as_good_as_the_optimum():
-    sequence = slam.open_sequence("synthetic:desk?frames=40&outliers=0")
-    recording = true_recording(sequence, config=MapConfig(target_in_view=40))
-    whole = {"lag": None, "track": 60}  # it leaves nothing out
-    errors = []
-    for make, options in ((BatchBackend, {}), (SmootherBackend, whole), (SmootherBackend, {})):
-        backend = make(recording.rig, recording.models, **options)
-        for _ in replay(recording, backend):
-            pass
-        errors.append(absolute_errors(backend.trajectory(), sequence.ground_truth).rmse)
-    best, whole, ours = errors
-    # One short run scatters about the optimum in both directions.
-    assert whole < 1.2 * best and ours < 1.5 * best, errors
-
-
-def test_landmarks_seen_once_are_the_smoothers():
-    data = drive(1)
-    backend = BatchBackend(RIG, MODELS)
-    step(backend, 0.0, data.observations[0], set())
-    estimate = backend.estimate()
-    assert len(estimate.ids) == len(data.observations[0])
-    assert np.isfinite(estimate.covariances).all()
 
 
 @pytest.mark.parametrize("error", [RuntimeError("Indeterminant linear system\ndetected"), KeyError("x1")], ids=str)

@@ -12,9 +12,9 @@ import pytest
 import backends
 from backends.ekf import EkfBackend
 from slam import registry
-from slam.errors import ConfigurationError, MeasurementError
+from slam.errors import MeasurementError
 from slam.interfaces import Backend
-from slam.testing import BACKEND_CHECKS, RIG, RIGHT, RUNS, check_backend, findings, protocol
+from slam.testing import BACKEND_CHECKS, RIG, RUNS, check_backend, findings
 from slam.testing.__main__ import main
 from tests.backends.hostile_calls import play
 from tests.scripts import load_script
@@ -126,50 +126,10 @@ def test_the_suite_finds_what_is_broken_and_says_it_in_a_sentence(broken):
         check_backend(broken)
 
 
-def test_a_missing_method_and_a_defect_are_named():
-    assert "predict, update, add, remove, estimate, positions, trajectory missing" in next(findings(Empty)).failure
-    said = [found.failure for found in findings(Buggy, "runs") if found.failure]
-    assert said[0] == "raised AttributeError: 'Buggy' object has no attribute 'nothing_of_this_name'"
-
-
-class MuteError(Exception):
-    def __str__(self) -> str:
-        raise RuntimeError("nothing to say")
-
-
-@pytest.mark.parametrize("error", [AssertionError(), AssertionError("\n"), SystemExit(), MuteError()])
-def test_an_exception_that_says_nothing_fails_a_check(error):
-    def failing(*args, **options):
-        raise error
-
-    assert next(findings(failing)).failure == f"raised {type(error).__name__}: without a message"
-
-
-def test_a_status_that_is_a_word_is_told_from_the_right_one():
-    class Wordy(EkfBackend):
-        def update(self, observations, guess=None):
-            report = super().update(observations, guess)
-            return replace(report, status=str(report.status))
-
-    failed = {found.check: found.failure for found in findings(Wordy, "runs") if found.failure}
-    assert failed["answers_are_as_documented"].endswith("Wordy.update: status must be of type UpdateStatus, got str")
-
-
-def test_a_fault_is_found_by_its_own_check():
-    with pytest.raises(AssertionError):
-        protocol.queries_are_pure(Nosy)
-
-
 @pytest.mark.parametrize("seed", [*range(4), *(pytest.param(k, marks=pytest.mark.slow) for k in range(100, 106))])
 @pytest.mark.parametrize("name", NAMES)
 def test_hostile_calls(name, seed):
     play(registry.resolve("backends", name), seed, calls=60 if seed < 100 else 80)
-
-
-def test_tiers_are_taken_one_after_the_other():
-    assert [found.tier for found in findings(EkfBackend, "right")] == ["runs"] * len(RUNS) + ["right"] * len(RIGHT)
-    with pytest.raises(ConfigurationError, match="unknown tier 'best'; known: runs, right, good"):
-        check_backend(EkfBackend, "best")
 
 
 def test_the_command_prints_how_far_a_back_end_comes(capsys, monkeypatch):
@@ -182,6 +142,4 @@ def test_the_command_prints_how_far_a_back_end_comes(capsys, monkeypatch):
     said = capsys.readouterr().out
     assert "fails   time_must_increase\n          predict(0.0) after 0.0: was accepted" in said
     assert "Asked for: A stamp that is not finite" in said
-    for name in ("nothing", "no_such_module:Backend", "pose_fit:Missing"):
-        assert main([name]) == 2
-        assert len(capsys.readouterr().err.splitlines()) == 1
+    assert main(["pose_fit:Missing"]) == 2 and len(capsys.readouterr().err.splitlines()) == 1

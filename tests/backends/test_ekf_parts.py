@@ -10,12 +10,13 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from backends.ekf.backend import EkfBackend
+from backends.ekf.camera import moved
 from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.innovation import UnsolvableError, Update, Whitened
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth
 from backends.ekf.motion import EulerCamera
 from backends.ekf.recovery import agreement
-from backends.ekf.solve import _descend, gate, solve
+from backends.ekf.solve import gate, solve
 from backends.ekf.state import FilterState
 from slam.data import Observations
 from slam.geometry import se3
@@ -69,24 +70,11 @@ def test_a_new_angles_world_is_the_same_state(phi):
     np.testing.assert_allclose(J, jacobian(moved, np.zeros(12)), atol=1e-7)
 
 
-@pytest.mark.parametrize("turn", [(0, 0, 1.5), (0, 0, 3.14), (1.5, 0, 0), (0, 2.0, 0), (1.0, 1.2, 1.5), (0, 0, 0)])
-def test_a_way_that_leads_to_the_singularity_gets_another_angles_world(turn):
-    """In which neither end of it is near; the state is the same."""
-    camera, _ = EulerCamera.first(MODELS, True)
-    camera = replace(camera, x=camera.x + np.linspace(0.01, 0.1, 12))
-    T = camera.pose @ se3.exp(np.array([*turn, 0, 0, 0]))
-    new, _ = camera.facing(T)
-    assert (new is camera) == (abs(np.sin(camera.at(T).x[4])) <= np.sqrt(0.5))
-    world, _ = camera.reanchored(T)
-    np.testing.assert_allclose(world.pose, camera.pose, atol=1e-12)
-    assert abs(world.x[4]) < 1e-9 and abs(np.sin(world.at(T).x[4])) < 0.11
-
-
 def test_a_step_in_pieces_has_the_noise_of_a_whole_one():
     """A fast turn runs through the singularity; its position had less noise than a slow one's."""
     first, _ = EulerCamera.first(MODELS, True)
     whole, split = (
-        replace(first, x=np.concatenate([first.x[:9], rate])).advanced(MODELS, 1e-4 * np.eye(12), 0.5)[2]
+        moved(replace(first, x=np.concatenate([first.x[:9], rate])), MODELS, 1e-4 * np.eye(12), 0.5, False)[2]
         for rate in (np.zeros(3), np.array([0.0, 4.0, 0.0]))
     )
     np.testing.assert_allclose(np.trace(split[3:6, 3:6]), np.trace(whole[3:6, 3:6]), rtol=0.35)  # other axes
@@ -98,8 +86,7 @@ def test_a_step_in_pieces_has_the_noise_of_a_whole_one():
 
 def covariance_of(P: np.ndarray) -> Covariance:
     """Of a camera and landmarks with a joint covariance."""
-    none = np.zeros((len(P), 0)), np.zeros((0, 3, 3))
-    return Covariance(P[:CAMERA].copy(), P[CAMERA:, CAMERA:].copy(), *none)
+    return Covariance(P.copy(), np.zeros((len(P), 0)), np.zeros((0, 3, 3)))
 
 
 @pytest.mark.parametrize("phi", ATTITUDES)
@@ -117,11 +104,8 @@ def test_measurement_jacobians(phi):
         return update.at(camera.moved(x[:12]), x[12:]).z
 
     H = jacobian(predicted, np.zeros(27))
-    found = update.at().innovation(np.ones((5, 3), bool))
-    expected = H @ P
-    np.testing.assert_allclose(
-        np.concatenate(found.HP, axis=1), expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max()
-    )
+    found, expected = update.at().innovation(), H @ P
+    np.testing.assert_allclose(found.HP, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
     np.testing.assert_allclose(
         found.S, expected @ H.T + 0.25 * np.eye(15), rtol=1e-5, atol=1e-6 * np.abs(found.S).max()
     )
@@ -163,10 +147,8 @@ def grown(rng: np.random.Generator) -> tuple[Covariance, np.ndarray]:
 
 def whole(covariance: Covariance) -> np.ndarray:
     """All of it as one matrix."""
-    h = len(covariance.head)
-    P = np.concatenate([covariance.head, np.concatenate([covariance.head[:, h:].T, covariance.marks], axis=1)])
-    n = len(P)
-    P = np.pad(P, (0, 3 * len(covariance.known)))
+    n = len(covariance.P)
+    P = np.pad(covariance.P, (0, 3 * len(covariance.known)))
     for i, block in enumerate(covariance.known):
         P[n + 3 * i : n + 3 * i + 3, n + 3 * i : n + 3 * i + 3] = block
     return P
@@ -194,7 +176,7 @@ def test_the_last_poses_are_kept():
     covariance, P = grown(np.random.default_rng(6))
     M, poses = np.eye(len(P)), [np.random.default_rng(k).standard_normal((6, 6)) for k in range(3)]
     for J in poses:
-        covariance = covariance.with_pose(J, 2)
+        covariance = covariance.advanced(J, 2, np.eye(12), np.zeros((12, 12)))
     kept = np.zeros((12, len(P)))
     kept[:6, :6], kept[6:, :6] = poses[2], poses[1]
     M = np.concatenate([M[:12], kept, M[12:]])
@@ -202,18 +184,9 @@ def test_the_last_poses_are_kept():
     g = numbers([4, 5, 6, 7, 8, 9, 10, 1, 12])
     back = covariance.rearranged(np.array([0, 3]), np.array([4, 5, 6, 7, 8, 9, 10, 1, 12]), np.array([11]))
     assert_equal_to_rounding(dense(back), P[np.ix_(g, g)])
-    found = np.delete(back.head[12:24], np.s_[12 : 24 + 6], axis=1)
+    found = np.delete(back.P[12:24], np.s_[12 : 24 + 6], axis=1)
     assert_equal_to_rounding(found, np.concatenate([poses[2], poses[1]]) @ P[:6, g])
     assert_equal_to_rounding(back.joint_poses(np.eye(6), 3)[-6:, -6:], P[:6, :6])
-
-
-def test_the_camera_moves():
-    covariance, P = grown(np.random.default_rng(8))
-    J, noise = np.eye(len(P)), positive(CAMERA, np.random.default_rng(7))
-    J[:CAMERA, :CAMERA] = np.random.default_rng(9).standard_normal((CAMERA, CAMERA))
-    P = J @ P @ J.T
-    P[:CAMERA, :CAMERA] += noise
-    assert_equal_to_rounding(whole(covariance.camera_moved(J[:CAMERA, :CAMERA], noise)), P)
 
 
 def test_a_correction_and_its_transport():
@@ -222,7 +195,7 @@ def test_a_correction_and_its_transport():
     covariance, P = grown(rng)
     past = rng.standard_normal((6, 6))
     M = np.insert(np.eye(len(P)), [12] * 6, np.pad(past, ((0, 0), (0, len(P) - 6))), axis=0)
-    covariance, P = covariance.with_pose(past, 2), M @ P @ M.T
+    covariance, P = covariance.advanced(past, 2, np.eye(12), np.zeros((12, 12))), M @ P @ M.T
     b, m, kept = 12 + 6 + 12, 12 + 6 + 33, np.r_[12:30]
     V = 0.1 * rng.standard_normal((m, 5))
     J, K = np.eye(CAMERA), rng.standard_normal((7, 3, 6))
@@ -233,7 +206,7 @@ def test_a_correction_and_its_transport():
     T = np.eye(len(P))
     T[:CAMERA, :CAMERA] = J
     T[b:m, :CAMERA] = K.reshape(-1, 6) @ J[:6]
-    found = covariance.corrected((V[:18], V[18:b], np.asfortranarray(V[b:])), np.zeros((5, 0)), J, K)
+    found = covariance.corrected(V, np.zeros((5, 0)), J, K)
     assert_equal_to_rounding(whole(found), T @ expected @ T.T)
 
 
@@ -251,12 +224,10 @@ def state_of(landmarks: int, coordinates) -> tuple[FilterState, np.ndarray, np.r
     return s.placed(coordinates, np.arange(landmarks), h, RIG.triangulation_covariance(h, 0.5)), h, rng
 
 
-def update_of(
-    s: FilterState, z: np.ndarray, coordinates, iterations: int, probability: float = 0.9999, guess=None
-) -> Update:
+def update_of(s: FilterState, z: np.ndarray, coordinates, iterations: int, probability: float = 0.9999) -> Update:
     """Of all landmarks of a state, by measurements (N, 3)."""
     measure = RectifiedMeasurement(RIG, replace(MODELS, gate_probability=probability))
-    return Update(s.camera, s.covariance, s.landmarks, np.arange(len(z)), z, measure, coordinates, iterations, guess)
+    return Update(s.camera, s.covariance, s.landmarks, np.arange(len(z)), z, measure, coordinates, iterations)
 
 
 def in_deviations(P: np.ndarray, of: np.ndarray) -> np.ndarray:
@@ -269,7 +240,7 @@ def test_the_prediction_is_as_printed():
     s, _, _ = state_of(4, InverseDepth())
     camera, P, dt = s.camera.x + 0.1 * np.arange(12.0) / 12, dense(s.covariance), 0.25
     s = replace(s, camera=replace(s.camera, x=camera))
-    found = s.advanced(dt, s.camera.advanced(MODELS, P[:12, :12], dt))
+    found = s.advanced(dt, moved(s.camera, MODELS, P[:12, :12], dt, False))
     A, W = np.eye(len(P)), np.zeros((len(P), 6))
     A[:6, 6:12] = dt * np.eye(6)
     W[:6], W[6:12] = dt * np.eye(6), np.eye(6)
@@ -329,7 +300,7 @@ def test_augmentation_is_the_derivative_of_triangulation(coordinates):
 # --- the update: iterated, gated ---
 
 
-def far_off(iterations: int, guess: bool = False, spread: float = 0.05) -> tuple[FilterState, Update]:
+def far_off(iterations: int, spread: float = 0.05) -> tuple[FilterState, Update]:
     """An update whose prior is 1.5 m and 0.15 rad off; points at 4 to 8 m are known to `spread` [m] in depth."""
     rng = np.random.default_rng(13)
     points = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (12, 3))
@@ -341,7 +312,7 @@ def far_off(iterations: int, guess: bool = False, spread: float = 0.05) -> tuple
     marks = FilterLandmarks.at(Euclidean(), np.arange(12), np.zeros((12, 3, 4)), known, 0)
     P = np.diag(np.concatenate([np.full(3, 1.5**2), np.full(3, 0.2**2), np.ones(6), off.ravel() ** 2]))
     s = replace(s, landmarks=marks, covariance=covariance_of(P))
-    return s, update_of(s, z, Euclidean(), iterations, 1 - 1e-15, truth if guess else None)
+    return s, update_of(s, z, Euclidean(), iterations, 1 - 1e-15)
 
 
 def ungated(update: Update):
@@ -362,11 +333,11 @@ def residuals(s: FilterState, update: Update, change: np.ndarray) -> np.ndarray:
     return np.concatenate([prior, ((update.z - z) / update.sigma).reshape(-1)])
 
 
-@pytest.mark.parametrize(("guess", "spread"), [(False, 0.05), (True, 0.05), (False, 0.5)])
-def test_the_iterated_update_is_the_maximum_of_the_posterior(guess, spread, monkeypatch):
+@pytest.mark.parametrize("spread", [0.05, 0.5])
+def test_the_iterated_update_is_the_maximum_of_the_posterior(spread, monkeypatch):
     """Also where landmarks move by much: an error of the pose displaces them from where they are by now."""
     monkeypatch.setattr("backends.ekf.solve._LINEAR", 1e-6)
-    s, update = far_off(50, guess, spread)
+    s, update = far_off(50, spread)
     deviation = np.sqrt(np.diag(dense(s.covariance)))
     solution = ungated(update)
     assert solution.used.all()
@@ -375,15 +346,6 @@ def test_the_iterated_update_is_the_maximum_of_the_posterior(guess, spread, monk
     np.testing.assert_allclose(corrected(s, update), deviation * best.x, atol=1e-5)
     w = solution.whitened.w
     assert w @ w == pytest.approx(2 * best.cost, rel=1e-3)  # νᵀS⁻¹ν there is the least cost
-
-
-@pytest.mark.parametrize("guess", [False, True])
-def test_a_step_that_lowers_no_cost_is_no_information(guess, monkeypatch):
-    """Where the mean does not move towards the measurements, the variance must not fall either."""
-    monkeypatch.setattr("backends.ekf.solve._descend", lambda now, rows, s, change: (now, change))
-    monkeypatch.setattr("backends.ekf.solve._linear", lambda whitened, change: False)
-    with pytest.raises(UnsolvableError, match="cost"):
-        ungated(far_off(5, guess)[1])
 
 
 def far_in_depth(seed: int) -> tuple[FilterState, Update, np.ndarray]:
@@ -424,54 +386,20 @@ def test_a_coordinate_at_its_limit_has_changed_by_so_much():
     assert made[2] > asked[2]
     np.testing.assert_array_equal(at.change[12:], made)
     expected = (update.z - at.z + (at.own @ made.reshape(-1, 3, 1))[:, :, 0]).reshape(-1)
-    np.testing.assert_allclose(at.innovation(np.ones((15, 3), bool)).nu, expected, atol=1e-9)
-
-
-def test_the_guess_costs_what_it_is_off_the_prior():
-    _, update = far_off(5, guess=True)
-    start = gate(update, at_guess=True).innovation.at
-    assert start.from_prior == pytest.approx(np.sum((start.change[:6] / np.repeat([1.5, 0.2], 3)) ** 2))
+    np.testing.assert_allclose(at.innovation().nu, expected, atol=1e-9)
 
 
 def test_a_prior_that_cannot_be_tried_does_not_end_the_others(monkeypatch):
     """Most contradict the prediction, and the wider priors fail numerically: what agrees with it still counts."""
-    _, update = far_off(5, guess=True)
+    _, update = far_off(5)
 
-    def failing(tried, at_guess=False):
-        if at_guess or tried is not update:
+    def failing(tried, T=None):
+        if T is not None:
             raise UnsolvableError("not positive definite")
         return replace(gate(tried), used=np.arange(12) < 5)
 
     monkeypatch.setattr("backends.ekf.recovery.gate", failing)
-    assert agreement(update, iter([np.eye(12)]), lambda: None).used.sum() >= 5
-
-
-def test_a_displaced_landmark_keeps_what_nothing_measures():
-    """Its error by a displacement of the world is that where it is now; so it is for one that had left the state."""
-    s, _, rng = state_of(8, InverseDepth())
-    s = replace(s, camera=replace(s.camera, transports=True))
-    points = s.landmarks.points + 0.3 * rng.standard_normal((8, 3))
-    P, W, change = dense(s.covariance), s.camera.world(), s.displaced(InverseDepth(), np.arange(8), points)
-    T = np.eye(36)
-    T[12:, :6] = (change.landmarks.gauge - s.landmarks.gauge).reshape(-1, 6) @ W
-    assert_equal_to_rounding(dense(change.covariance), T @ P @ T.T)
-    np.testing.assert_allclose(change.landmarks.points, points, atol=1e-9)
-    some = s._rearranged(np.array([2, 5]), np.array([0, 1, 3, 4, 6, 7]), np.arange(0))
-    other = some.displaced(InverseDepth(), np.arange(8), points)
-    rows = other.landmarks.rows_of(np.arange(8))
-    g = np.concatenate([np.arange(12), (12 + 3 * rows[:, None] + np.arange(3)).reshape(-1)])
-    assert_equal_to_rounding(dense(other.covariance)[np.ix_(g, g)], T @ P @ T.T)
-
-
-def test_a_shortened_step_shortens_the_velocities_too(monkeypatch):
-    """They went all the way while the pose stayed behind."""
-    _, update = far_off(5)
-    costs = iter([1.0, 2.0, 0.5])  # where it is, after the whole step, after half of it
-    monkeypatch.setattr("backends.ekf.solve.Linearisation.cost", lambda self, rows: next(costs))
-    change = 0.01 * np.random.default_rng(0).standard_normal(48)
-    after, step = _descend(update.at(), np.ones((12, 3), bool), np.zeros(42), change)
-    np.testing.assert_allclose(step, 0.5 * change, atol=1e-15)
-    np.testing.assert_allclose(after.change, 0.5 * change, atol=1e-12)
+    assert agreement(replace(update, guess=np.eye(4)), lambda: None).used.sum() >= 5
 
 
 def test_what_is_taken_out_was_never_there():
@@ -490,7 +418,7 @@ def test_what_is_taken_out_was_never_there():
             assert fall == pytest.approx(every.distances()[gone[0]], rel=1e-6)
         fresh = whitened(replace(update, z=np.where(mask[:, None], np.nan, update.z)), np.ones(12, bool))
         np.testing.assert_allclose(without.distances(), fresh.distances(), rtol=1e-6, atol=1e-9)
-        V, W = (np.concatenate(one.gain_root()[0]) for one in (without, fresh))
+        V, W = (np.delete(one.gain_root()[0], np.s_[12 : s.covariance.begin], 0) for one in (without, fresh))
         np.testing.assert_allclose(in_deviations(V @ V.T, P), in_deviations(W @ W.T, P), atol=1e-9)
 
 
@@ -506,7 +434,7 @@ def test_no_linearisation_measures_a_displacement_of_the_world(coordinates, tran
     for camera in (None, there):
         change = 0.02 * rng.standard_normal((12, 3)) * s.landmarks.c
         at = update.at(camera, change.reshape(-1))
-        H = np.concatenate(at.innovation(np.ones((12, 3), bool)).HP, axis=1)
+        H = at.innovation().HP
         U = np.zeros((48, 6))
         U[:6] = np.linalg.inv((s.camera if transports else at.camera).world())
         marks = s.landmarks if transports else s.landmarks.moved(coordinates, slice(None), change)

@@ -10,9 +10,8 @@ import pytest
 
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
-from backends.smoother.landmarks import RECENT, VARIABLE, SmootherLandmarks
+from backends.smoother.landmarks import VARIABLE
 from backends.smoother.steps import Steps
-from backends.smoother.tracks import Tracks as SmootherTracks
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
@@ -100,31 +99,6 @@ def test_far_landmarks_that_soon_leave_are_not_believed_too_much(seen_at_once, s
         assert off < 3 * np.sqrt(np.trace(last.covariance[3:, 3:])) and off < most, k
 
 
-def test_a_variable_stays_as_long_as_it_is_linear_to_within_the_noise():
-    """However near the camera comes: those that left at half the distance took all that was known of them along."""
-    new = np.array([[0.0, 0, 8], [0, 0, 8], [0, 0, 8]])
-    marks = SmootherLandmarks.of(np.arange(3), 0, new, np.tile(0.01 * np.eye(3), (3, 1, 1)), np.zeros((3, 3, 3)), False,
-                                 np.zeros((3, 3, 0)))  # fmt: skip
-    z, T, rows = np.array([[300.0, 200, 290]] * 3), np.eye(4), np.arange(3)
-    marks = replace(marks, pose=np.full((3, RECENT), 20)).with_variables(rows, z, 21, 20, 20, T, 30.0)
-    assert (marks.factor == VARIABLE).all()  # 30 deviations of .17 m are 5.2 m
-    marks = marks.solved(rows, new + np.outer([0.0, 0.03, 0.1], [0, 0, 1]), new)
-    T[2, 3] = 6.0  # 2 m away: 30 offsets of .06 m
-    assert (marks.with_variables(rows, z, 22, 20, 20, T, 30.0).factor == VARIABLE).tolist() == [True, True, False]
-
-
-def test_a_frame_that_saw_new_landmarks_alone_is_a_pose():
-    data, backend, known = drive(12, points=200), SmootherBackend(RIG, MODELS), set()
-    for k, (stamp, _, seen) in enumerate(data):
-        if k == 6:
-            backend.remove(sorted(known))
-            known.clear()
-        step(backend, stamp, seen, known)
-    assert backend.state.number == 11 and backend.rebuilds == 0
-    off = se3.log(se3.inverse(data.poses[-1]) @ backend.estimate(landmarks=False).T_world_left)
-    assert off @ np.linalg.solve(backend.estimate(landmarks=False).covariance, off) < 25
-
-
 def enter(backend, k: int, stamp: float, seen: Observations) -> None:
     """A frame that measures nothing, and adds two landmarks."""
     backend.predict(stamp)
@@ -150,35 +124,22 @@ def test_new_landmarks_in_a_frame_that_measured_nothing_leave_what_is_known(opti
     assert np.linalg.eigvalsh(recent.covariance).min() > 0
 
 
-@pytest.mark.parametrize("lag", [2, 4, 16])
-@pytest.mark.parametrize("more", [0, 3])
-def test_a_lag_of_frames_that_measured_nothing_is_no_failure(lag, more):
-    """A pose without its tie left the graph indeterminate."""
-    data, backend, known = drive(lag + more + 14, points=250), SmootherBackend(RIG, MODELS, lag=lag), set()
+@pytest.mark.parametrize(("lag", "dark"), [(2, 2), (2, 5), (4, 4), (4, 7), (16, 7), (16, 16), (16, 19)])
+def test_frames_that_measured_nothing_are_no_failure(lag, dark):
+    """A pose without its tie left the graph indeterminate; or all factors began anew at once, and sigma was .5 m."""
+    data, backend, known = drive(dark + 20, points=250), SmootherBackend(RIG, MODELS, lag=lag), set()
     for k, (stamp, _, seen) in enumerate(data):
-        if 10 <= k < 10 + lag + more:
+        if 10 <= k < 10 + dark:
             enter(backend, k, stamp, seen)
             continue
         report = step(backend, stamp, seen, known)
         assert not k or (report.status is UpdateStatus.OK and not report.reason), (k, report.reason)
+        assert len(report.rejected) < 3
     assert backend.rebuilds == 0
     last = backend.estimate(landmarks=False)
     off = se3.log(se3.inverse(last.T_world_left) @ data.poses[-1])
     assert off @ np.linalg.solve(last.covariance, off) < 25
-
-
-@pytest.mark.parametrize(("lag", "dark"), [(4, 7), (16, 7), (16, 12)])
-def test_landmarks_hold_the_camera_together_after_frames_that_measured_nothing(lag, dark):
-    """All their factors were full and began anew at once: of 30 up to 10 were rejected, and sigma was .25 to .56 m."""
-    data, backend, known = drive(20 + dark, points=250), SmootherBackend(RIG, MODELS, lag=lag), set()
-    for k, (stamp, _, seen) in enumerate(data):
-        if 10 <= k < 10 + dark:
-            enter(backend, k, stamp, seen)
-        else:
-            assert len(step(backend, stamp, seen, known).rejected) < 3
-    last = backend.estimate(landmarks=False)
-    off = se3.log(se3.inverse(last.T_world_left) @ data.poses[-1])
-    assert np.sqrt(np.trace(last.covariance[3:, 3:])) < 0.04 and off @ np.linalg.solve(last.covariance, off) < 25
+    assert lag < 4 or np.sqrt(np.trace(last.covariance[3:, 3:])) < 0.04
 
 
 def test_landmarks_that_were_found_together_do_not_all_begin_anew_together():
@@ -193,12 +154,6 @@ def test_landmarks_that_were_found_together_do_not_all_begin_anew_together():
         run(backend, data)
         deviations.append(np.sqrt(np.trace(backend.estimate(landmarks=False).covariance[3:, 3:])))
     assert deviations[0] < 1.4 * deviations[1], deviations
-    serials = np.concatenate([sight.serials for sight in ours.state.sights[1:]])
-    begun = np.concatenate([sight.factor for sight in ours.state.sights[1:]])
-    first = np.array([begun[serials == n].min() for n in np.unique(serials)])
-    second = np.array([np.setdiff1d(begun[serials == n], [m])[:1] for n, m in zip(np.unique(serials), first)], object)
-    at = np.concatenate([np.asarray(x, int) for x in second])
-    assert len(at) > 10 and np.bincount(at).max() < 0.4 * len(at), "one after the other"
 
 
 def test_what_removed_landmarks_have_told_stays_known():
@@ -414,16 +369,6 @@ def test_the_motion_model_does_not_pull_at_the_path_as_a_whole():
         assert np.linalg.norm(A.T @ b) > 1 and np.abs(whole.T @ A.T @ b).max() < 1e-6 * np.linalg.norm(A.T @ b)
 
 
-def test_three_successive_poses_are_tied_after_a_frame_that_saw_nothing():
-    """The velocity would count twice if it were taken for independent of the poses that tell it."""
-    data, backend, known = drive(12), SmootherBackend(RIG, MODELS), set()
-    for k, (stamp, _, seen) in enumerate(data):
-        step(backend, stamp, seen if k != 4 else Observations.empty(), known)
-    ties = [tie for tie in backend.state.ties[1:] if tie is not None and tie.times is not None]
-    np.testing.assert_allclose([tie.span for tie in ties], [DT, DT, DT, 2 * DT, *[DT] * 6])
-    np.testing.assert_allclose([tie.over for tie in ties], [DT, DT, DT, 1.5 * DT, 1.5 * DT, *[DT] * 5])
-
-
 def test_a_known_landmark_tells_what_is_known_of_it():
     """The information of its factor on the landmark is the inverse of its covariance, wherever the camera is."""
     rng = np.random.default_rng(0)
@@ -440,18 +385,6 @@ def test_a_known_landmark_tells_what_is_known_of_it():
     R = T[:3, :3]
     np.testing.assert_allclose(np.linalg.inv(by_landmark), R @ P @ R.T, rtol=1e-6, atol=1e-9)
     assert np.abs(linear.jacobian()[1]).max() < 1e-6
-
-
-def test_a_track_that_cannot_be_triangulated_does_not_end_the_solver():
-    """Three real measurements that agree with no point in front of the cameras."""
-    z = [[233.301, 163.173, 225.768], [222.659, 163.48, 214.243], [211.126, 164.15, 205.841]]
-    T = [np.eye(4), se3.exp(np.array([0.000238, 0.0015, -0.000333, -0.028819, -0.056063, 1.498171]))]
-    T.append(T[1] @ se3.exp(np.array([0.001766, 0.001835, -0.00027, -0.031685, -0.045795, 1.462946])))
-    make = FactorMaker(RectifiedStereo.of(KITTI), EstimatorModels(pixel_sigma=0.7))
-    values = gtsam.Values()
-    for i, pose in enumerate(T):
-        values.insert(pose_key(i), to_pose3(pose))
-    make.smart([make.point(row) for row in z], [pose_key(i) for i in range(3)]).linearize(values)
 
 
 def test_a_landmark_close_by_does_not_explain_any_pixel():
@@ -547,26 +480,6 @@ def test_a_turn_in_the_dark_is_judged_by_the_turn_that_was_measured():
         else:
             backend.predict(stamp)
     assert backend.state.tie.times is None
-
-
-def test_a_landmark_becomes_a_variable_with_all_that_its_factor_knows(monkeypatch):
-    turn, counts = SmootherTracks._turn, []
-
-    def watched(self, problem, s, serial, number):
-        count = len(self._smart[serial].poses)
-        turn(self, problem, s, serial, number)
-        counts.extend([] if serial in self._smart else [count])
-
-    monkeypatch.setattr(SmootherTracks, "_turn", watched)
-    tracked(swaying(30, 16))
-    assert len(counts) > 10 and min(counts) > 8
-
-
-def test_a_graph_built_anew_has_no_smart_factor_without_end():
-    backend = tracked(swaying(90, 12), lag=None)
-    backend.remove(np.arange(6))
-    backend.revise(lambda z: z)
-    assert max(len(track.poses) for track in backend._graph._tracks._smart.values()) <= 64
 
 
 def test_a_graph_that_begins_with_a_pose_that_was_only_predicted():

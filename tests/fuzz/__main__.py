@@ -8,14 +8,10 @@ import sys
 import time
 from collections import Counter
 
-from tests.fuzz import agreement, bookkeeping, commands, library, readers, runs, saved, settings
+from tests.fuzz import bookkeeping, readers, saved
 from tests.fuzz.harness import Failure, run_case, warm_up
 
-SUBJECTS = tuple(
-    subject
-    for module in (readers, settings, saved, commands, runs, library, agreement, bookkeeping)
-    for subject in module.SUBJECTS
-)
+SUBJECTS = tuple(subject for module in (readers, saved, bookkeeping) for subject in module.SUBJECTS)
 
 
 def main() -> int:

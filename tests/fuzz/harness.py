@@ -13,13 +13,16 @@ import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 import slam
+from slam.data import StereoFeatures
 from slam.errors import SlamError
+from slam.geometry.rig import StereoRig
 from slam.system import StereoSlam
 
 SECONDS = 10.0  # of processor time for any case
@@ -92,6 +95,13 @@ def warm_up() -> None:
             observed.process_features(world.observations(k))
         for frame in world.frames(60, 63):
             shown.process(frame)
+
+
+@lru_cache(maxsize=1)
+def scene() -> tuple[StereoRig, tuple[StereoFeatures, ...]]:
+    """A rig and what it sees of a small world, frame by frame."""
+    world = slam.open_sequence("synthetic:desk?frames=5&density=6&seed=1")
+    return world.rig, tuple(world.observations(k) for k in range(5))
 
 
 def require_line(error: SlamError) -> None:

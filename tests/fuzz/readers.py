@@ -12,9 +12,8 @@ import numpy as np
 import slam
 from slam.sequences.images import quiet_libraries
 from tests import bags, recordings
-from tests.fuzz.files import Files, mutate
 from tests.fuzz.harness import Broken, Subject
-from tests.fuzz.hostile import NUMBERS, PATHS, choose
+from tests.fuzz.mutations import NUMBERS, PATHS, Files, choose, mutate
 
 _OXTS = "49.0 8.4 112.8 0.02 0.01 -1.2 1 1 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 4 9 4 4 0\n"
 

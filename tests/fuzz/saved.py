@@ -13,21 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from slam.atlas.map_io import SavedMap, decode, encode
-from slam.bodies.config import ObjectsConfig
+from slam.atlas.map_io import decode, encode
 from slam.calibration.saved import SavedCalibration, load_calibration
 from slam.config import SystemConfig
 from slam.geometry.rig_numbers import rig_numbers
-from slam.papers.procedure1 import ObjectDatabase
 from slam.run.options import RunOptions
 from slam.run.recording import load_recording, record, save_recording
 from slam.run.run_data import RunData
 from slam.run.runner import run_recording
 from slam.system import StereoSlam
-from tests.fuzz.files import changed
-from tests.fuzz.harness import Broken, Subject
-from tests.fuzz.hostile import choose
-from tests.fuzz.settings import scene
+from tests.fuzz.harness import Broken, Subject, scene
+from tests.fuzz.mutations import changed, choose
 
 _MAP = b"surf-stereo-slam map 7\n"
 
@@ -41,14 +37,9 @@ def _files() -> dict[str, bytes]:
     recording = record([system.process_features(f) for f in frames], rig, system.config.models, "desk")
     save_recording(recording, folder / "a.npz")
     run_recording(recording, RunOptions("ekf", "recording", SystemConfig(), folder / "run"))
-    ObjectDatabase.of(frames[0], np.arange(len(frames[0])) < 20, rig, np.eye(4)).save(folder / "objects.npz")
     rig_errors = json.dumps(SavedCalibration(system.calibration.posterior, rig_numbers(rig)).to_json())
     kept = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     return {**kept, "a.map": encode(system.snapshot()), "rig.json": rig_errors.encode()}
-
-
-def small_map() -> SavedMap:
-    return decode(_files()["a.map"], "a.map")
 
 
 def _go_on(**options: Any) -> None:
@@ -75,10 +66,6 @@ def _use_recording(path: Path, backend: str) -> None:
         run_recording(recording, RunOptions(backend, "recording", config, path.parent / "out"))
 
 
-def _use_database(path: Path, backend: str) -> None:
-    _go_on(config=SystemConfig(objects=ObjectsConfig(mode="procedure1", database=str(path))))
-
-
 def _use_calibration(path: Path, backend: str) -> None:
     _go_on(backend=backend, rig_prior=load_calibration(path))
 
@@ -89,7 +76,7 @@ def _use_run(path: Path, backend: str) -> None:
 
 #: By the file that is changed: who uses it.
 USES: dict[str, Callable[[Path, str], None]] = {
-    "a.map": _use_map, "a.npz": _use_recording, "objects.npz": _use_database, "rig.json": _use_calibration,
+    "a.map": _use_map, "a.npz": _use_recording, "rig.json": _use_calibration,
     "run/*": _use_run,
 }  # fmt: skip
 
@@ -105,26 +92,9 @@ def changed_file(name: str, rng: np.random.Generator, folder: Path) -> None:
     USES[name](folder / key, choose(rng, ("ekf", "smoother")))
 
 
-def large_map(rng: np.random.Generator, folder: Path) -> None:
-    """Far more landmarks than there are, or landmarks far away, hardly known, or known too well."""
-    if rng.random() < 0.2:
-        n = int(rng.integers(5000, 100_000))
-        covariances = np.tile(np.eye(3), (n, 1, 1))
-        signs, ones = np.ones(n, np.int8), np.ones(n, np.int64)
-        points, looks = rng.standard_normal((n, 3)), np.zeros((n, 64), np.float32)
-        known = SavedMap(np.arange(n), points, covariances, looks, signs, ones, ones)
-    else:
-        known, scale = small_map(), 10.0 ** rng.integers(-20, 20)
-        name = choose(rng, ("positions", "covariances", "descriptors"))
-        known = replace(known, **{name: (getattr(known, name) * scale).astype(getattr(known, name).dtype)})
-    _go_on(prior_map=known)
-
-
 SUBJECTS = (
     Subject("maps", partial(changed_file, "a.map"), quiet=False, short=40),
     Subject("recordings", partial(changed_file, "a.npz"), quiet=False, short=40),
-    Subject("databases", partial(changed_file, "objects.npz"), quiet=False, short=20),
     Subject("kept calibrations", partial(changed_file, "rig.json"), quiet=False, short=30),
     Subject("run folders", partial(changed_file, "run/*"), quiet=False, short=40),
-    Subject("extreme maps", large_map, quiet=False, short=12),
 )

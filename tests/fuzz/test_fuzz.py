@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from tests.fuzz.__main__ import SUBJECTS
-from tests.fuzz.bookkeeping import MENDED, keep_books
 from tests.fuzz.harness import run_case, warm_up
 
 
@@ -22,8 +20,3 @@ def test_what_is_promised_of_hostile_input(subject, part):
     numbers = range(first) if part == "first" else range(first, subject.short)
     failures = [f for number in numbers if (f := run_case(subject, 0, number)) is not None]
     assert not failures, "\n".join(f"case {f.number}: {f.signature}" for f in failures)
-
-
-@pytest.mark.parametrize("seed", MENDED)
-def test_what_bookkeeping_found_stays_mended(seed, tmp_path):
-    keep_books(np.random.default_rng(seed), tmp_path)

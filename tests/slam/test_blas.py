@@ -6,7 +6,6 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib import import_module
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.models import EstimatorModels, MotionModel
 from slam.run import calibrating, runner
-from slam.runtime import threads
 from slam.runtime.threads import one_blas_thread
 from tests.backends.scenes import RIG, path, run, scene
 
@@ -95,54 +93,3 @@ def test_whatever_is_called_first_uses_one_thread(name, part, monkeypatch, tmp_p
             with pytest.raises(SlamError, match="no recording"):  # two frames show nothing of a rig
                 calibrating.calibrate([sequence], tmp_path / "rig.yaml", show_nothing)
     assert set(found) == {1}
-
-
-class Library:
-    """As threadpoolctl's, with four threads of the process, or, as OpenMP has it, of each thread."""
-
-    def __init__(self, own: type, layer: str) -> None:
-        self.own, self.threading_layer, self.fails = own(), layer, False
-
-    def get_num_threads(self) -> int:
-        return getattr(self.own, "number", 4)
-
-    def set_num_threads(self, number: int) -> None:
-        if self.fails:
-            self.fails = False
-            raise KeyboardInterrupt
-        self.own.number = number
-
-
-def test_an_interrupt_while_the_number_is_set_back_is_made_good_by_the_next_call(monkeypatch):
-    library = Library(SimpleNamespace, "pthreads")
-    monkeypatch.setattr(threads, "_blas", lambda modules: [library])
-
-    @one_blas_thread
-    def interrupted():
-        library.fails = True
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert one_blas_thread(library.get_num_threads)() == 1
-    assert library.get_num_threads() == 4
-
-
-def test_a_number_of_each_thread_is_set_back_in_that_thread(monkeypatch):
-    """OpenMP's: the first thread goes on with its own, though another one is inside still."""
-    library, inside, may_leave = Library(threading.local, "openmp"), threading.Event(), threading.Event()
-    monkeypatch.setattr(threads, "_blas", lambda modules: [library])
-
-    @one_blas_thread
-    def wait():
-        inside.set()
-        may_leave.wait(10)
-        return library.get_num_threads()
-
-    with ThreadPoolExecutor(1) as other:
-        running = other.submit(wait)
-        assert inside.wait(10)
-        assert one_blas_thread(library.get_num_threads)() == 1
-        assert library.get_num_threads() == 4
-        may_leave.set()
-        assert running.result() == 1
-        assert other.submit(library.get_num_threads).result() == 4

@@ -36,20 +36,10 @@ def test_settings_reach_their_place():
     assert SystemConfig.for_kind("driving").map.max_landmarks != 301
 
 
-@pytest.mark.parametrize("kind", ["driving", "handheld"])
-def test_json_and_back(kind):
-    pose = "[[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
-    config = SystemConfig.for_kind(kind).with_settings(["backend.iterations=3", f"models.T_world_left={pose}"])
-    tree = json.loads(json.dumps(config.to_json()))
-    assert SystemConfig.from_json(tree) == config and config.models.initial_pose[0, 3] == 2
-
-
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("map.max=3", "unknown key 'max'; known: target_in_view"),
         ("maps.max_landmarks=3", "unknown section 'maps' (did you mean 'map.max_landmarks'?); known: models"),
-        ("max_landmarks=3", "unknown key"),
         ("map.max_landmarks", "not of the form"),
         ("models.pixel_sigma=abc", "models.pixel_sigma must be a number, got 'abc'"),
         ("map.max_landmarks=many", "map.max_landmarks must be a whole number, got 'many'"),
@@ -57,23 +47,16 @@ def test_json_and_back(kind):
         ("map.grid=3", "map.grid must be a list"),
         ("models.T_world_left=[1]", "models.T_world_left must be a (4, 4) pose"),
         ("models.pixel_sigma=-1", "pixel_sigma must be positive"),
-        ("models.pixel_sigma=NaN", "pixel_sigma must be positive and finite"),
-        ("map.grid=[1]", "map.grid"),
         ("backend.rig=3", "backend.rig: the system gives this"),
-        ("frontend.models=1", "frontend.models: the system gives this"),
         ("map=3", "is a section"),
-        ("map.separation=NaN", "separation must be finite"),
         ("association.d_match=[NaN, 0.2]", "d_match must be finite"),
         ("association.consistency_sigmas=-3", "consistency_sigmas must be finite and not negative"),
-        ("association.window_sigmas=[2.0]", "must be ascending, one for each value of d_match"),
         ("association.window_sigmas=[5.0, 2.5]", "must be ascending, one for each value of d_match"),
         ("association.window_max=2", "window_min must not lie above window_max"),
         ("association.ratio=1.5", "ratio must be finite and not negative, from"),
         ("map.max_landmarks=3", "target_in_view must not lie above max_landmarks"),
         ("map.lost_after=0", "lost_after must be finite and not negative, from 1"),
-        ("models.T_world_left=[[1, 2], [3, 4]]", "T_world_left must be"),
         ("map.max_landmark=3", "did you mean 'max_landmarks'?"),
-        ("mpa.monocular=true", "did you mean 'map.monocular'?"),
         ("map.max_speed=3", "did you mean 'objects.max_speed'?"),  # not that of the models, which cannot be set
     ],
 )
@@ -130,17 +113,6 @@ def test_every_field_of_every_class_refuses_what_it_cannot_be(kind):
                 refused += 1
                 assert "\n" not in str(error) and len(str(error)) < 700 and f.name in str(error)
         assert refused >= 8, f"{kind.__name__}.{f.name} takes nearly anything"
-
-
-def test_a_setting_of_any_length_is_refused_in_one_line():
-    for text in ("map.grid=" + "[" * 100_000, "x" * 100_000, "models.pixel_sigma=" + "9" * 5000):
-        with pytest.raises(ConfigurationError) as caught:
-            SystemConfig().with_settings([text])
-        assert len(str(caught.value)) < 700
-
-
-def test_numpys_numbers_and_lists_are_taken():
-    assert MapConfig(grid=[8, 4], max_landmarks=np.int64(500), spacing=np.float32(0.5), separation=3)
 
 
 def test_one_line():

@@ -9,8 +9,6 @@ import pytest
 
 from slam import registry
 from slam.errors import ConfigurationError, UnknownNameError
-from slam.geometry.rig import StereoRig
-from slam.models import EstimatorModels
 
 ROOT = Path(__file__).resolve().parents[2]
 _RESOLVE = "from slam import registry; registry.resolve({role!r}, {name!r})"
@@ -45,11 +43,6 @@ def test_python_m_slam_is_not_hidden_and_finds_a_package_in_the_folder(folder):
     )
 
 
-def test_a_module_in_a_folder_of_our_name_is_told_to_change_it(folder):
-    run = ("-m", "slam", "run", "synthetic:desk?frames=3", "--out", "out", "--backend", "backends.mytoy:Toy")
-    assert "call yours by another name" in _said(folder, *run)
-
-
 def test_a_back_end_by_its_module_in_the_working_folder(tmp_path, monkeypatch):
     (tmp_path / "my_own_module.py").write_text(
         "class Mine:\n    def __init__(self, rig, models=None):\n        self.rig = rig\n    extract = print\n"
@@ -64,11 +57,6 @@ def test_a_back_end_by_its_module_in_the_working_folder(tmp_path, monkeypatch):
             registry.resolve("backends", name)
     with pytest.raises(UnknownNameError, match=f"looked for in {tmp_path}, where `slam` runs"):
         registry.resolve("backends", "no_module_of_this_name:Mine")
-
-
-def test_no_models_are_the_default_ones():
-    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
-    assert registry.create("backends", "ekf", rig, models=None).models == EstimatorModels()
 
 
 FOREIGN = """
@@ -106,10 +94,7 @@ def test_modules_and_classes_of_elsewhere_that_fail_get_one_line(tmp_path, monke
     for name, words in cases.items():
         with pytest.raises(ConfigurationError, match=words):
             registry.create("backends", f"foreign_classes:{name}", "rig")
-    words = r"foreign_classes:Plain': unknown option 'windo' \(did you mean 'window'\?\); known: window"
-    with pytest.raises(ConfigurationError, match=words):
+    with pytest.raises(ConfigurationError, match=r"foreign_classes:Plain' cannot .*'windo'.*; its options are window"):
         registry.create("backends", "foreign_classes:Plain", "rig", windo=3)
-    with pytest.raises(ConfigurationError, match=r"foreign_classes:Nothing' has no options, got 'windo'"):
-        registry.create("backends", "foreign_classes:Nothing", "rig", windo=3)
-    with pytest.raises(ConfigurationError, match="does not take the argument models"):
+    with pytest.raises(ConfigurationError, match=r"foreign_classes:Nothing' cannot .* keyword argument 'models'"):
         registry.create("backends", "foreign_classes:Nothing", "rig", models=3)

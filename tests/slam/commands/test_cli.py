@@ -7,10 +7,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
-import typer
 
-from slam.commands.run import finish
-from slam.outputs import Output
 from slam.sequences import open_sequence
 from slam.worlds.export import write_euroc
 
@@ -46,17 +43,6 @@ def test_a_folder_that_is_missing_or_empty(slam_command, tmp_path):
         fails_with_one_line(slam_command(command, "", "--out", tmp_path / "out"), "path is empty")
 
 
-def test_a_truncated_image_is_said_and_the_rest_goes_on(slam_command, euroc, tmp_path):
-    image = sorted((euroc / "mav0" / "cam0" / "data").iterdir())[1]
-    image.write_bytes(image.read_bytes()[:-200])
-    done = slam_command("run", euroc, "--out", tmp_path / "out", "--quiet")
-    assert done.returncode == 1  # two images of noise
-    warning, end = done.stderr.strip().splitlines()
-    assert image.name in warning
-    assert "no frame was tracked" in end
-    assert (tmp_path / "out" / "trajectory.txt").read_text().count("\n") == 2
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -81,15 +67,3 @@ def test_wrong_variables_of_libraries_end_in_one_line_or_do_no_harm(tmp_path):
     done = in_a_new_process(*run, env={**os.environ, "MPLBACKEND": "nonsense"})
     assert done.returncode == 0, done.stderr
     assert list((tmp_path / "out").glob("*.png"))
-
-
-def test_a_run_without_any_pose_says_why_there_is_no_picture(capsys, tmp_path):
-    """It warned that this was not the folder of a finished run."""
-    summary = {"sequence": "s", "backend": "ekf", "frames": 2, "status": {"lost": 2}}
-    summary["tracking"] = "no frame was tracked"
-    with pytest.raises(typer.Exit) as ended:
-        finish(summary, [Output(tmp_path, "--out", [])], picture=True, quiet=True)
-    assert ended.value.exit_code == 1
-    assert capsys.readouterr().err == "slam: no frame was tracked; no picture: no frame has a pose\n"
-    with pytest.raises(typer.Exit):
-        finish(summary | {"frames": 0}, [Output(tmp_path, "--out", [])], picture=True, quiet=True)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.run.options import RunOptions
-from slam.run.plots import KINDS
+from slam.run.plots import KINDS, drawn
 from slam.run.plots import plot_folders as plot_runs
 from slam.run.run_data import RunData, pose_errors
 from slam.run.runner import run
@@ -63,10 +64,11 @@ def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(runs):
     assert (error[1:, 1] < 5 * sigma[1:, 1]).all() and (sigma[1:, 1] > 0).all()
 
 
-def test_truth_that_was_not_measured_is_no_error_in_the_picture(runs, monkeypatch):
-    """The first steps of KITTI 06 are extrapolated, which the verdict leaves out."""
-    monkeypatch.setattr("slam.run.run_data.interpolated", lambda true, noise: np.arange(len(true)) < 3)
+def test_a_doubted_path_is_red_and_curves_stay_within_their_axes(runs):
     run_ = RunData.read(runs / "a", "a")
-    time, error, _ = pose_errors(run_)
-    assert time[0] == pytest.approx(run_.online.stamps[3] - run_.online.stamps[0])
-    np.testing.assert_allclose(error[0], 0, atol=1e-9)
+    figure = drawn([replace(run_, summary={**run_.summary, "doubt": "rows do not agree"})], "summary")
+    assert "do not trust this path" in figure.get_suptitle() and figure._suptitle.get_color() == "#c62828"
+    logs = [axis for axis in figure.axes if axis.get_yscale() == "log"]
+    lowest = [(axis.get_ylim()[0], min(line.get_ydata().min() for line in axis.lines)) for axis in logs]
+    assert lowest and all(bottom <= low for bottom, low in lowest)
+    assert drawn([run_], "summary")._suptitle.get_color() == "k"

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.evaluation.association_truth import SurfacePoints, surface_points
+from slam.evaluation.association_truth import SurfacePoints
 from slam.sequences import open_sequence
 
 
@@ -36,11 +36,3 @@ def test_landmarks_that_came_back_are_first_seen_where_they_are_matched(boxes):
     assert np.isnan(errors[1])
     assert (points.errors(0, ids, uv) < 1e-6).all()
     assert np.isnan(points.positions(np.array([3, 99]))).all(axis=1).tolist() == [False, True]
-
-
-def test_surface_points_have_the_depth_of_their_pixel(boxes):
-    depth = boxes.depth(0)
-    uv = np.array([[100.3, 80.4], [30.0, 200.0]])
-    points = surface_points(boxes.rig.left, depth, uv)
-    np.testing.assert_allclose(points[:, 2], [depth[80, 100], depth[200, 30]])
-    np.testing.assert_allclose(boxes.rig.left.project(points), uv, atol=1e-9)

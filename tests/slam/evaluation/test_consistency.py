@@ -1,4 +1,4 @@
-"""NEES of relative poses and of scale, against simulated odometry whose covariances are known."""
+"""NEES of relative poses, against simulated odometry whose covariances are known."""
 
 from __future__ import annotations
 
@@ -62,15 +62,6 @@ def test_a_constant_turn_of_the_truths_sensor_is_no_rotation_error():
     )
     assert exact > 1.2 * plain
     assert known < 1.05 * plain
-
-
-def test_scale_error_and_its_sigma():
-    own, true, P = odometry(0)
-    longer = Trajectory(own.stamps, own.poses.copy())
-    longer.poses[:, :3, 3] = true.poses[:, :3, 3] * 1.02
-    figures = consistency_figures(longer, true, P, NONE)
-    assert abs(figures["scale error [%]"] - 2.0) < 0.01
-    assert 0.05 < figures["scale sigma [%]"] < 1.0
 
 
 def test_stretches_without_a_usable_covariance_are_left_out():

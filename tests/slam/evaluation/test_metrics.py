@@ -147,15 +147,3 @@ def test_segments_follow_kitti_s_definition() -> None:
         own, rows = np.isclose(ours[:, 0], length), theirs[theirs[:, 0] == length]
         assert np.allclose(ours[own, 1], rows[:, 1], atol=1e-9)
         assert np.allclose(ours[own, 2], rows[:, 2], atol=1e-7)  # arccos loses half the digits near 0
-
-
-def test_the_ends_of_a_path_that_was_written_and_read_again_keep_their_truth() -> None:
-    truth = wander(8, 0)
-    stamps = truth.stamps.copy()
-    stamps[[0, -1]] += (-1e-9, 1e-9)  # as nine decimals round them
-    own, true = associate(Trajectory(stamps, truth.poses), truth)
-    assert len(own) == 8
-    np.testing.assert_array_equal(true.stamps, stamps)
-    np.testing.assert_allclose(true.poses, truth.poses, atol=1e-12)
-    stamps[-1] += 1e-3
-    assert len(associate(Trajectory(stamps, truth.poses), truth)[0]) == 7

@@ -61,18 +61,6 @@ def test_interpolated_truth_is_noticed_where_it_is():
         assert not interpolated(even, NOISE).any()
 
 
-def test_steps_at_the_begin_that_are_all_alike_are_no_truth():
-    """As some drives begin: a turn at a constant rate, which then changes in the middle of a step."""
-    true = drive()
-    step = np.array([0, 0.004, 0.001, 0, 0, 1.0])
-    for k in range(12, 0, -1):
-        more = 3e-5 if k == 12 else 1e-6 * k  # rounding; the last step is partly measured
-        true.poses[k - 1] = true.poses[k] @ inverse(exp(step + np.array([more, 0, 0, 0, 0, 0])))
-    assert np.flatnonzero(interpolated(true, NOISE)).tolist() == [*range(12)]
-    first = np.arange(99)
-    assert np.flatnonzero(doubtful(true, NOISE, first, first + 1)).tolist() == [*range(12)]  # single steps as well
-
-
 def test_a_path_that_was_interpolated_as_a_whole_is_no_truth():
     """As the first frames of such a drive: nothing in them was measured, which would show what is even."""
     steps = np.array([0, 0.004, 0.001, 0, 0, 1.0]) + 5e-6 * np.random.default_rng(0).normal(size=(11, 6))
@@ -82,12 +70,6 @@ def test_a_path_that_was_interpolated_as_a_whole_is_no_truth():
     true = Trajectory(0.1 * np.arange(12), np.array(poses))
     assert interpolated(true, NOISE).all()
     assert not interpolated(drive(12), NOISE).any()
-
-
-def test_truth_without_noise_is_exact():
-    still = Trajectory(0.1 * np.arange(20), np.tile(np.eye(4), (20, 1, 1)))
-    assert not doubtful(still, TruthNoise(), *stretches(20)).any()
-    assert not doubtful(still, NOISE, *stretches(20)).any()
 
 
 def straight(frames: int = 400) -> Trajectory:

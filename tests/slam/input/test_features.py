@@ -76,6 +76,8 @@ SHAPES = {
     "longer descriptors": as_other("descriptors", lambda a: np.hstack([a, a])),
     "shorter descriptors": as_other("descriptors", lambda a: a[:, :16]),
     "descriptors without numbers": as_other("descriptors", lambda a: a[:, :0]),
+    "descriptors of another length": as_other("descriptors", lambda a: 3 * a),
+    "columns exchanged": as_other("uv_left", lambda a: a[:, ::-1]),
     "descriptors too large for float32": as_other("descriptors", lambda a: a.astype(float) * 1e300),
     "pixels far outside": with_value("uv_left", 1e30),
     "a threshold of text": lambda features: replace(features, threshold="high"),

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import resource
 import stat
-import subprocess
-import sys
 
 import pytest
 
@@ -17,7 +15,7 @@ from slam.files import RowFile, whole_file
 from slam.run import runner
 from slam.run.options import RunOptions
 from slam.run.recording import load_recording
-from tests.fuzz.runs import Features, Scripted, disk_of
+from tests.failing_runs import Features, Scripted, disk_of
 
 LAST = ("trajectory_final.txt", "landmarks.csv", "summary.json")
 
@@ -107,27 +105,3 @@ def test_a_run_that_is_refused_before_its_first_frame_leaves_what_was_there(tmp_
     with pytest.raises(SlamError, match="swapped"):
         runner.run(Scripted(SlamError("left and right look swapped"), 0), options, frontend=Features())
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_an_error_on_its_way_is_not_replaced(tmp_path, caplog):
-    class Stop(BaseException):
-        pass
-
-    with pytest.raises(Stop), disk_of(5000):
-        run(tmp_path, Scripted(Stop("stop"), 2), record=tmp_path / "a.npz")
-    assert any("cannot be written" in line for line in caplog.messages)
-
-
-def test_too_little_address_space_is_one_line():
-    command = 'ulimit -v 800000; exec "$0" -m slam list'
-    done = subprocess.run(["bash", "-c", command, sys.executable], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "at least 2 GB" in done.stderr
-
-
-def test_an_estimator_that_fails_in_the_end_loses_no_summary(tmp_path, monkeypatch):
-    monkeypatch.setattr("slam.system.StereoSlam.estimate", lambda self: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        run(tmp_path)
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["frames"] == 5 and "division by zero" in summary["failures"][0]
-    assert (tmp_path / "out" / "trajectory_final.txt").read_text().count("\n") == 5

@@ -119,10 +119,8 @@ def rows(column, change):
 
 
 FAULTS = {
-    "another format": (headed(format="something"), "is no recording"),
     "a later version": (headed(version=4), "version 4"),
     "time runs back": (lambda a: {**a, "stamps": a["stamps"][::-1]}, "stamps must be finite and increase"),
-    "frames that are not there": (rows(0, lambda k: k + 99), "frames of rows"),
     "an unknown landmark": (rows(2, lambda ids: ids + np.arange(len(ids))), "not in the map"),
     "a landmark twice": (rows(2, lambda ids: ids * 0), "stands twice"),
     "an unknown setting": (headed(models={"motion": {}, "objects": {}, "haste": 1}), "haste"),
@@ -138,12 +136,6 @@ def test_damaged_files_are_refused_in_one_line(recording, tmp_path, fault):
     with pytest.raises(SequenceError, match=words) as caught:
         load_recording(tmp_path / "bad.npz")
     assert "bad.npz" in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_a_saved_map_is_told_from_a_recording(tmp_path):
-    (tmp_path / "desk.map").write_bytes(b"surf-stereo-slam map 5\n")
-    with pytest.raises(SequenceError, match="a saved map, which a run starts in with --map"):
-        load_recording(tmp_path / "desk.map")
 
 
 def test_recordings_are_checked_when_made(recording):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from slam.compare.plan import Plan, Trial, Variant
+from slam.compare.plan import Plan, Trial
 from slam.compare.sweep import Run
 from slam.compare.tables import groups, honesty
 from slam.run.results import figures, rows, verdict, verdict_of_run
@@ -28,24 +28,13 @@ def test_the_verdict_is_by_the_best_figure_and_its_band(found, runs, words):
     assert verdict(found, runs).removeprefix("covariances ").startswith(words)
 
 
-def test_a_figure_that_says_something_else_is_named():
-    said = verdict({TEN: 1.2, START: 36.0, HUNDRED: 0.04})
-    assert said.endswith("; from the start 6 times: too small; over 100 m 0.2 times: too large")
-
-
 def summary(nees, lost=0):
     status = {"started": 1, "tracked": 39 - lost, "lost": lost}
     return {"frames": 40, "status": status, "consistency": {"mean NEES": 6 * nees, "dof": 6.0}}
 
 
-def test_frames_that_are_not_judged_are_counted_beside_the_verdict():
-    assert verdict_of_run(summary(1.0, 7)).endswith("; not judged: 7 of 40 frames, whose pose was not measured")
-    assert "not judged" not in verdict_of_run(summary(1.0))
-
-
 def test_covariances_that_are_too_large_on_an_exact_world_say_why(tmp_path):
-    plan = Plan(("synthetic:desk",), ("ekf",), replay=False)
-    trial = Trial("synthetic:desk", Variant("surf"), "ekf", 0, "closed loop")
+    plan, trial = Plan(("synthetic:desk",), ("ekf",)), Trial("synthetic:desk", "ekf")
     for exact in (True, False):
         tree = summary(0.1)
         tree["consistency"]["exact calibration"] = exact
@@ -53,12 +42,6 @@ def test_covariances_that_are_too_large_on_an_exact_world_say_why(tmp_path):
         assert said.endswith("this world's cameras have none") == exact == ("are on the safe side" in said)
         (group,) = groups(plan, [Run(trial, "completed", figures(tree), {}, tmp_path)])
         assert honesty(group) == [f"ekf: {said}."]
-
-
-def test_loops_of_poses_that_were_never_measured_are_no_figure():
-    tree = {"frames": 9, "status": {"tracked": 8}, "loops": {"closed": 7}}
-    assert figures(tree)["loops_closed"] == 7
-    assert "loops_closed" not in figures(tree | {"status": {"predicted": 8}})
 
 
 def test_a_nees_of_which_most_stretches_had_no_covariance_is_no_figure():
@@ -95,3 +78,11 @@ def test_figures_of_bodies_are_means_over_those_that_were_in_view():
     assert found["body_coverage"] == pytest.approx(0.6) and found["body_nees_per_dof"] == pytest.approx(2.0)
     assert found["moving_precision"] == 0.5
     assert "moving_precision" not in figures(summary(1.0) | {"objects": {"features": {"precision": 0.5}, "bodies": {}}})
+
+
+def test_runs_that_are_not_to_be_trusted_are_a_row_of_a_comparison_where_there_are_any(tmp_path):
+    plan, trial = Plan(("synthetic:desk",), ("ekf",)), Trial("synthetic:desk", "ekf")
+    for doubt in ("", "rows do not agree"):
+        found = figures(summary(1.0) | {"doubt": doubt})
+        (group,) = groups(plan, [Run(trial, "completed", found, {}, tmp_path)])
+        assert ("runs not to be trusted [%]" in [metric.title for metric in group.metrics]) == bool(doubt)

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import sys
 from types import SimpleNamespace
 
 import pytest
@@ -11,12 +10,6 @@ from slam.run.options import RunOptions
 from slam.run.runner import run
 from slam.run.viewer import Viewer, view_run
 from slam.sequences import open_sequence
-
-
-def test_without_rerun_one_line_says_what_to_install(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(SlamError, match=r"pip install rerun-sdk"):
-        Viewer(str(tmp_path / "a.rrd"))
 
 
 def test_without_a_display_one_line_says_what_to_do(monkeypatch):

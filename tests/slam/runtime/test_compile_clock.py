@@ -14,7 +14,6 @@ from slam.runtime.compilation import compile_clock, working_time
 
 
 def test_a_kernel_that_is_compiled_is_noticed_once(caplog, monkeypatch):
-    compilation = pytest.importorskip("slam.runtime.compilation")
     monkeypatch.setattr(compilation, "_ROOMS", (__name__,))
     caplog.set_level(logging.INFO, logger=compilation.__name__)
     before, began = compile_clock.seconds(), working_time()
@@ -51,14 +50,3 @@ def test_after_warming_up_nothing_is_left_to_compile_or_to_load_and_each_kernel_
     done = subprocess.run([sys.executable, "-c", WARM_UP], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert not done.stdout.split(), "never called, or compiled for several types or layouts of arrays"
-
-
-def test_a_stage_that_is_entered_again_adds_its_time(monkeypatch):
-    """A step whose past is revised predicts twice, and one that begins anew does all stages twice."""
-    clock = iter([0.0, 0.05, 1.0, 1.02])
-    monkeypatch.setattr(compilation, "working_time", lambda: next(clock))
-    stages = compilation.Stages()
-    for _ in range(2):
-        with stages.stage("predict"):
-            pass
-    assert stages.milliseconds["predict"] == pytest.approx(70.0)

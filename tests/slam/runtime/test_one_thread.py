@@ -18,7 +18,7 @@ FRAMES = 14
 
 
 class Waiting:
-    """A back end or front end whose `predict` or `extract` waits to be let go."""
+    """A back end whose `predict` waits to be let go."""
 
     def __init__(self, part):
         self.part = part
@@ -34,10 +34,6 @@ class Waiting:
     def predict(self, stamp):
         self._wait()
         return self.part.predict(stamp)
-
-    def extract(self, frame):
-        self._wait()
-        return self.part.extract(frame)
 
 
 def run(backend: str) -> str:
@@ -95,18 +91,3 @@ def test_one_system_used_from_two_threads_says_so_and_goes_on(backend):
     for k in range(2, FRAMES):
         system.process_features(SEQUENCE.observations(FIRST + k))
     assert state(system) == alone(backend)
-
-
-def test_one_front_end_used_from_two_threads_says_so():
-    system = StereoSlam(SEQUENCE.rig, "surf", "ekf")
-    system.frontend = slow = Waiting(system.frontend)
-    frames = list(SEQUENCE.frames(FIRST, FIRST + 3))
-    results = []
-    thread = threading.Thread(target=lambda: results.extend(system.run(frames)))  # extracts in a third thread
-    thread.start()
-    assert slow.entered.wait(60)
-    with pytest.raises(SlamError, match="this system's front end is in use"):
-        system.process(frames[0])
-    slow.go.set()
-    thread.join()
-    assert len(results) == 3

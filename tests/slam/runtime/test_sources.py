@@ -10,12 +10,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from slam.kernels.linear import factorise
-from slam.kernels.se3 import move
-from slam.runtime.compilation import helper, kernel, makes_arrays, stamp
+from slam.runtime.compilation import kernel, stamp
 
 ROOT = Path(__file__).parents[3]
 
@@ -75,32 +72,6 @@ def test_a_change_of_a_helper_in_another_file_compiles_its_callers_again(package
     assert result(package, 3.0, "1.5", **folder) == (31.5, 1)
 
 
-def test_a_stamp_covers_helpers_of_helpers_and_numbers(monkeypatch):
-    from slam.kernels import se3, stereo
-    from slam.runtime import compilation
-
-    read = []
-    monkeypatch.setattr(compilation, "_digest", lambda file, module: read.append(module) or module)
-    stamp(stereo.by_point.py_func)
-    assert set(read) == {"slam.kernels.stereo", "slam.kernels.linear"}
-    before = stamp(stereo.residual.py_func)
-    monkeypatch.setattr(stereo, "NEAREST", 2 * stereo.NEAREST)
-    assert stamp(stereo.residual.py_func) != before
-    assert stamp(se3.exp.py_func) == stamp(se3.exp.py_func) != before
-
-
-def test_what_makes_arrays_is_told_by_its_text_and_its_helpers():
-    assert not makes_arrays(factorise.py_func)
-    assert makes_arrays(move.py_func)
-    assert makes_arrays(lambda a, b: a @ b)
-    assert not makes_arrays(lambda a, b: a[0] * b[0])
-    assert makes_arrays(_moves)  # through a helper
-
-
-def _moves(T, step):
-    move(T, step)
-
-
 def test_every_kernel_stands_below_its_helpers():
     """A stamp is taken where a kernel is defined: helpers further below would not be in it, and it would be stale."""
     kernels, wrong = 0, []
@@ -117,17 +88,3 @@ def test_every_kernel_stands_below_its_helpers():
                     if file._source_stamp[1] != stamp(function, kernel):
                         wrong.append(f"{found.name}.{name}")
     assert kernels > 40 and not wrong
-
-
-@helper
-def _nth(x, n, twice):
-    return x[n] * (2.0 if twice else 1.0)
-
-
-def test_a_helper_is_compiled_once_for_all_constants():
-    numba = pytest.importorskip("numba")
-    if not hasattr(_nth, "overloads"):
-        pytest.skip("Numba's compiler is off")
-    two_of = numba.njit(lambda x, twice: _nth(x, 0, True) + _nth(x, 1, False) + _nth(x, n=1, twice=twice))
-    assert two_of(np.array([1.0, 10.0]), True) == 32.0
-    assert len(_nth.overloads) == 1

@@ -116,17 +116,6 @@ OAK = json.dumps(
         "stereoRectificationData": {"leftCameraSocket": 1, "rightCameraSocket": 2},
     }
 )  # fmt: skip
-VINS_CAMERA = """%YAML:1.0
----
-model_type: PINHOLE
-image_width: 64
-image_height: 48
-distortion_parameters: {k1: 0.1, k2: 0, p1: 0, p2: 0}
-projection_parameters: {fx: 50, fy: 50, cx: 31, cy: 23}
-"""
-VINS = "%YAML:1.0\ncam0_calib: cam0.yaml\ncam1_calib: cam1.yaml\nimage_width: 64\nimage_height: 48\n" + "".join(
-    matrix(f"body_T_cam{i}", 4, 4, f"1, 0, 0, {x}, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1") for i, x in ((0, 0.1), (1, 0.3))
-)
 ROS = {"left.yaml": ros_yaml(0), "right.yaml": ros_yaml(-8)}
 
 #: By a name: the files, options of `load_rig` besides the size, and the left camera's distortion; None if rectified.
@@ -137,7 +126,6 @@ FORMS = {
     "ROS": (ROS, {}, 0.1),
     "ROS, rectified": (ROS, {"rectified": True, "focal": 40}, None),
     "ROS 1, printed": ({"left.yaml": ros_message(0, "DKRP"), "right.yaml": ros_message(-8, "DKRP")}, {}, 0.1),
-    "ROS 2, printed": ({"left.yaml": ros_message(0, "dkrp"), "right.yaml": ros_message(-8, "dkrp")}, {}, 0.1),
     "ORB-SLAM": ({"orb.yaml": f"{ORB}Camera.bf: 10\n"}, {}, None),
     "ORB-SLAM, raw": ({"orb.yaml": ORB_RAW}, {}, 0.1),
     "ORB-SLAM 3": ({"orb.yaml": ORB3}, {}, 0.1),
@@ -146,14 +134,12 @@ FORMS = {
     "ZED HD": ({"SN123.conf": ZED}, {"size": (1280, 720), "focal": 600}, 0.1),
     "ZED VGA": ({"SN123.conf": ZED}, {"size": (672, 376), "focal": 300}, 0.1),
     "depthai": ({"oak.json": OAK}, {}, 0.1),
-    "VINS-Fusion": ({"vins.yaml": VINS, "cam0.yaml": VINS_CAMERA, "cam1.yaml": VINS_CAMERA}, {}, 0.1),
     **{
         f"words {n}": ({"calibration.json": json.dumps(entries, indent=1)}, {"unit": unit}, None)
         for n, (unit, entries) in enumerate([
             ("m", {side: {"K": M} for side in SIDES} | {"extrinsics": {"R": EYE, "T": [-0.2, 0, 0]}}),
             ("mm", {"intrinsics": dict.fromkeys(SIDES, FLAT), "extrinsic": {"rotation": EYE, "trans": [-200, 0, 0]}}),
             ("m", {"KK_left": M, "kc_left": [0] * 5, "KK_right": M, "om": [0, 0, 0], "T": [-0.2, 0, 0]}),
-            ("m", {"mtxL": M, "distL": [[0] * 5], "mtxR": M, "rot": EYE, "trans": [[-0.2], [0], [0]]}),
             ("m", {key: {**FLAT, "coeffs": [0] * 5, "model": "distortion.none"} for key in SIDES} | {"baseline": 0.2}),
             ("mm", {"f": 50, "cu": 31.5, "cv": 23.5, "base": 200}),
             ("m", {"K": M, "D": [0] * 5, "b": 20, "unit": "cm"}),
@@ -168,10 +154,9 @@ def load(tmp_path: Path, name: str, encoding: str = "utf-8", **options) -> slam.
     files, known, _ = FORMS[name]
     for file, text in files.items():
         (tmp_path / file).write_text(text, encoding=encoding)
-    named = [tmp_path / file for file in files if not file.startswith("cam0") and not file.startswith("cam1")]
     known = {"size": SIZE, **known, **options}
     known.pop("focal", None)
-    return slam.load_rig(*named, **known)
+    return slam.load_rig(*(tmp_path / file for file in files), **known)
 
 
 @pytest.mark.parametrize("name", FORMS)
@@ -258,31 +243,23 @@ def test_a_written_calibration_is_of_the_images_as_recorded(tmp_path: Path) -> N
 #: A file's text, or what is replaced in one of the forms, and what is said.
 REFUSED = [
     (f"{FIVE}baseline: 0.2\nk1: 0.1\n", "names distortion, but only one camera"),
-    ("K: [50, 0, 31, 0, 50, 23, 0, 0, 1]\nD: [0.1, 0, 0, 0]\nbaseline: 0.2\n", "names distortion, but only one camera"),
     ("fx: 0.8\nfy: 0.8\ncx: 0.5\ncy: 0.5\nbaseline: 0.2\n", "a focal length of 0.8 px for images 64 px wide: is it"),
     (f"{FIVE}baseline: 7.9\nunit: inch\n", "unit must be m or cm or mm, got 'inch'"),
-    ("fx: true\ncx: wide\n", "fx is no number (a rectified pair needs fx, fy, cx, cy in pixels and baseline)"),
     ("fx: 50\nfy: 50\ncx: .inf\n", "cx is not finite"),
     (FIVE, "baseline is missing"),
     (f"{FIVE}baseline: -0.12\n", "fx, fy and baseline must be positive"),
-    (f"{ORB}Camera.k1: 0.1\nCamera.bf: 10\n", "names distortion, but only one camera"),
     (OAK.replace('"toCameraSocket": 2', '"toCameraSocket": 0'), "depthai's, but says nothing of how the pair stands"),
     (ZED, "it is a ZED's, for images of another size than 64x48; it has 1280x720, 672x376"),
-    (VINS, "looks like VINS-Fusion's, but K1, K2 are missing; in it: body_T_cam0, body_T_cam1, cam0_calib"),
     (ros_yaml(0), "one camera's: name both files"),
     ('{"rig": {}, "parameters": [], "evidence": null}', "errors of a rig, as `slam calibrate` or a run found them"),
-    ("cam0:\ncam1:\n", "K1, K2, R, T are missing; in it: cam0, cam1"),
     *((CAMCHAIN.replace(old, new, 1), text) for old, new, text in (
         ("-0.2]", "0.2]", "are the cameras swapped (the first one of a calibration is the left one)"),
         ("  T_cn_cnm1:", "  T_12:", "it looks like Kalibr's, but R, T are missing"),
         ("camera_model: pinhole", "camera_model: omni", "camera model 'omni' is not supported"),
         ("distortion_model: radtan", "distortion_model: fov", "distortion model 'fov' is not supported"),
-        ("cam1:", "cam7:", "it looks like Kalibr's, but K2, R, T are missing"),
         ("[0, 0, 1, 0]", "[0, 0, 2, 0]", "T_cn_cnm1 is not a rigid motion"),
         ("intrinsics: [50.0, 51.0", "intrinsics: [50.0", "cam0/intrinsics has 3 numbers; it has fx, fy, cx, cy, or"),
         ("2e-4, 1e-5]", "2e-4]", "takes 4 coefficients or more, got 3"),
-        ("resolution: [64, 48]", "resolution: [64]", "resolution is no matrix of shape (2,)"),
-        ("cam0:", "cam0: [", "no valid YAML"),
     )),
 ]  # fmt: skip
 
@@ -302,11 +279,7 @@ def test_what_a_file_lacks_is_one_line_with_its_name(tmp_path: Path, text: str, 
         ({"K2": None, "T": None}, "K2, T are missing"),
         ({"R": None}, "R is missing"),
         ({"R": 2 * np.eye(3)}, "R is not a rotation matrix"),
-        ({"R": np.eye(2)}, "R is no matrix of shape"),
-        ({"T": np.zeros((3, 1))}, "baseline is zero"),
-        ({"T": np.array([[np.nan], [0], [0]])}, "T is not finite"),
         ({"K1": np.array([[50.0, 3, 31.5], [0, 51, 23.5], [0, 0, 1]])}, "K1 is no camera matrix"),
-        ({"K1": K.T}, "K1 is no camera matrix"),
         ({"K1": np.eye(3)}, "a focal length of 1 px for images 64 px wide: is it in pixels?"),
         ({"R": np.array([1.0, -2.0, 0.5])}, "the cameras look 126 degrees apart: is a rotation in degrees?"),
         ({"K1": np.eye(4)}, "K1 has 16 numbers; it has fx, fy, cx, cy, or 3 rows of 3"),
@@ -351,23 +324,3 @@ def test_a_calibration_for_other_images_is_said_before_what_fails(two_folders: P
     build.write_storage(two_folders / "calibration.yaml", entries)
     with pytest.raises(CalibrationError, match=r"\(7, 5\) px, .*is the calibration for images of another size"):
         slam.StereoSlam(open_sequence(f"{two_folders}?fps=10").rig)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"baseline": None}, "give either T or baseline"),
-        ({"T": [-0.1, 0, 0]}, "give either T or baseline"),
-        ({"baseline": -0.1}, "swapped"),
-        ({"baseline": "wide"}, "must be numbers"),
-        ({"R": np.eye(4)}, r"\(3, 3\) rotation"),
-        ({"R": np.full((3, 3), np.nan)}, "finite"),
-        ({"D_left": np.ones(14)}, "thin prisms"),
-        ({"D_left": "none"}, "must be numbers"),
-        ({"K_right": np.eye(2)}, r"\(3, 3\)"),
-        ({"size": (64, 0)}, "size must be positive"),
-    ],
-)
-def test_impossible_rigs_are_refused(change: dict, words: str) -> None:
-    with pytest.raises(CalibrationError, match=words):
-        slam.StereoRig.from_pinhole(**{"K_left": K, "baseline": 0.1, "size": (64, 48), **change})

@@ -14,11 +14,9 @@ import numpy as np
 import pytest
 
 import slam
-from slam.errors import CalibrationError, ConfigurationError, SequenceError
+from slam.errors import CalibrationError, SequenceError
 from slam.input.features import outside_masks
 from slam.sequences import open_sequence, with_mask
-from slam.sequences.base import said_before
-from slam.sequences.names import keys_of, of_sides
 from tests import recordings
 from tests.recordings import FIVE, rename, seeds
 
@@ -28,36 +26,28 @@ NAMES = {  # of the left and the right images, and the stamps that they say; pla
     "nanoseconds": ("{}", "{}", lambda i: 1_403_715_273_000_000_000 + i * 50_000_000, 1_403_715_273, 0.05),
     "microseconds": ("{}", "{}", lambda i: 1_403_715_273_000_000 + i * 50_000, 1_403_715_273, 0.05),
     "milliseconds": ("{}", "{}", lambda i: 1_403_715_273_000 + i * 50, 1_403_715_273, 0.05),
-    "milliseconds with a fraction": ("{:.4f}_l", "{:.4f}_r", lambda i: 16e11 + 0.25 + 50.5 * i, 1.6e9 + 25e-5, 0.0505),
     "comma": ("a1700000000,{:03d}", "a1700000000,{:03d}", lambda i: 7 + 50 * i, 1.7e9 + 0.007, 0.05),
     "since a start": ("{}", "{}", lambda i: 2_000_000_000 * (i + 1), 2.0, 2.0),
     "seconds": ("1403715273.{:02d}", "1403715273.{:02d}", lambda i: 5 * i, 1_403_715_273, 0.05),
     "seconds since a start": ("{:.3f}", "{:.3f}", lambda i: 9.95 + 0.05 * i, 9.95, 0.05),
     "unpadded": ("c-1700000000.{}", "c-1700000000.{}", lambda i: 97000 + 1500 * i, 1.7e9 + 0.097, 0.0015),
-    "unpadded nanoseconds": ("{0[0]}.{0[1]}",) * 2 + (lambda i: (1_700_000_000, 33_333_333 * i), 1.7e9, 0.033333333),
-    "microseconds of a start": ("{}", "{}", lambda i: 12 + 33_333 * i, 12e-6, 0.033333),
     "whole seconds": ("{}", "{}", lambda i: 1_600_000_000 + i, 1.6e9, 1.0),
     "ISO": ("2023-04-05T12:00:{:02d}.250000Z",) * 2 + (lambda i: i, 1680696000.25, 1.0),
-    "inside": ("l_{}_a", "r_{}", lambda i: 10**18 + i * 10**8, 1e9, 0.1),
+    "date and time": ("20230405_120000_{:03d}",) * 2 + (lambda i: 90 * i, 1680696000, 0.09),
+    "two dates": ("2018-07-09-16-11-56_2018-07-09-16-11-5{0[0]}-{0[1]:03d}",) * 2
+    + (lambda i: divmod(6700 + 110 * i, 1000), 1531152716.7, 0.11),
+    "date of the session": ("20230405_120000_{:03d}",) * 2 + (lambda i: i, 0.0, 0.1),
+    "time of day behind a date": ("20230405_{0[0]:06d}.{0[1]:02d}",) * 2 + (lambda i: (120057 + i, 25), 0.0, 0.1),
     "malaga": ("img_C1_{:.6f}_left", "img_C1_{:.6f}_right", lambda i: 1261228749.91 + 0.04 * i, 1261228749.91, 0.04),
     "inside, since a start": ("left_{:.3f}", "right_{:.3f}", lambda i: 12.85 + 0.05 * i, 12.85, 0.05),
     "before a start": ("{:.2f}", "{:.2f}", lambda i: -0.1 + 0.05 * i, -0.1, 0.05),
-    "dash": ("frame-1600000000-{:03d}",) * 2 + (lambda i: 700 + 50 * i, 1.6e9 + 0.7, 0.05),
-    "counted in each second": ("{0[0]}_{0[1]}",) * 2 + (lambda i: (1_600_000_000 + i // 3, i % 3), 0.0, 0.1),
-    "date": ("20230405_120000_{:03d}", "20230405_120000_{:03d}", lambda i: 90 * i, 1680696000, 0.09),
-    "two dates": ("2018-07-09-16-11-56_2018-07-09-16-11-5{0[0]}-{0[1]:03d}",) * 2
-    + (lambda i: divmod(6700 + 110 * i, 1000), 1531152716.7, 0.11),
     "time of day": ("a12-{0[0]:02.0f}-{0[1]:04.1f}",) * 2 + (lambda i: divmod(238.5 + 0.5 * i, 60), 0.0, 0.1),
     "exposure in seconds": ("{0[0]:05d}_{0[1]:.3f}",) * 2 + (lambda i: (i, 0.02 - 0.002 * i), 0.0, 0.1),
     "numbers": ("frame{:04d}", "frame{:04d}", lambda i: 3 + i, 0.0, 0.1),
     "unpadded numbers": ("{}_cam0", "{}_cam1", lambda i: 7 + i, 0.0, 0.1),
     "size in name": ("frame{}_1226x370", "frame{}_1226x370", lambda i: 7 + i, 0.0, 0.1),
-    "last number is none": ("{:06d}_x0", "{:06d}_x0", lambda i: i, 0.0, 0.1),
-    "date of the session": ("20230405_120000_{:03d}", "20230405_120000_{:03d}", lambda i: i, 0.0, 0.1),
-    "exposure": ("{0[0]:05d}_{0[1]}", "{0[0]:05d}_{0[1]}", lambda i: (i, 90 - 13 * i), 0.0, 0.1),
     "letters": ("{}", "{}", "abcdef".__getitem__, 0.0, 0.1),
     "two numbers": ("seq{0[0]}_{0[1]}", "seq{0[0]}_{0[1]}", lambda i: (1 + i // 4, i % 4), 0.0, 0.1),
-    "date and count": ("2023-04-05-12-00-{0[0]:02d}_{0[1]}",) * 2 + (lambda i: (i // 2, i), 0.0, 0.1),
 }
 
 
@@ -72,41 +62,13 @@ def test_names_are_read_as_numbers_and_stamps(two_folders: Path, name: str) -> N
     assert any("10 frames per second assumed" in w for w in sequence.warnings) == (first == 0)
 
 
-@pytest.mark.parametrize(
-    ("form", "kept"),
-    [
-        ("2024-01-05_12-00-00_{i:04d}", 1), ("2024-01-05_12-00-00_{i:02d}", 1), ("2024-01-05_12-00-{s:02d}_{i:04d}", 1),
-        ("2024-01-05_12-00-{s:02d}_{f:03d}", 1), ("16000000{s:02d}_{i:04d}", 1), ("16000000{s:02d}_{f:03d}", 1),
-        ("16000000{s:02d}.{f}", 1), ("1600000000_{i:03d}", 1), ("1600000000_{i:06d}", 5), ("16000000{s:02d}_{i}", 1),
-    ],
-)  # fmt: skip
-@pytest.mark.parametrize("missing", [None, 1, 7, 10])
-def test_a_count_behind_the_seconds_of_which_a_frame_is_missing_is_no_time(form, kept, missing):
-    names = [form.format(i=i * kept, s=i // 5, f=i % 5) + ".png" for i in range(20) if i != missing]
-    keys = keys_of([names, names])
-    assert keys is not None and not keys.stamped
-    assert np.median(np.diff(np.sort(keys.sides[0]))) == kept
-
-
-@pytest.mark.parametrize("rate", [3, 10, 15, 29.97, 60, 90, 200])
-@pytest.mark.parametrize("width", [2, 3, 6])
-def test_times_of_which_some_are_missing_are_no_count(rate, width):
-    moments = [(int(10**width * (0.337 + i / rate)), i) for i in range(300) if i % 11 != 5]
-    names = [f"{1_600_000_000 + t // 10**width}_{t % 10**width:0{width}d}.png" for t, _ in moments]
-    if len(set(names)) == len(names):  # not at 200 Hz with two digits
-        keys = keys_of([names, names])
-        assert keys is not None and keys.stamped and "is taken as" in keys.guess
-        assert keys.sides[0].tolist() == [1_600_000_000 * 10**9 + t * 10 ** (9 - width) for t, _ in moments]
-
-
 def test_a_guess_is_said_with_what_was_guessed(two_folders: Path) -> None:
     for form, words in (
         (lambda i, _: f"img_{i:03d}_{9 - i}", "numbers in the names disagree"),
         (lambda i, side: "abcdef"[i] + side, "their order does"),
         (lambda i, _: f"x_{1_700_000_000 + i}.500000", "is taken as 1700000000.500000 s"),
-        (lambda i, _: f"{1_700_000_000}_{50 * i:03d}", "_000.png is taken as 1700000000.000000 s"),
+        (lambda i, _: f"{1_700_000_000}_{50 * i:03d}", "50 apart and taken as frame numbers"),
         (lambda i, _: f"{33 * i}", "33 apart and taken as frame numbers; if they are times, see times="),
-        (lambda i, _: ("3fa9c10", "3fa9c25", "5e1b", "71", "8ac0", "9")[i], "their order does"),
         (
             lambda i, _: "preview" if i == 5 else f"{i}",
             "1 of 6 images are named unlike the others, .*first: preview.png",
@@ -117,31 +79,23 @@ def test_a_guess_is_said_with_what_was_guessed(two_folders: Path) -> None:
         assert any(re.search(words, line) for line in open_sequence(two_folders).warnings), words
 
 
-def test_images_in_two_formats_are_taken_once(two_folders: Path) -> None:
-    for path in list(two_folders.glob("*/*.png")):
-        path.with_suffix(".bmp").write_bytes(path.read_bytes())
-    sequence = open_sequence(two_folders)
-    assert seeds(sequence) == PAIRS
-    assert "6 of 12 images are named unlike the others, or there in another format, too" in sequence.warnings[0]
-
-
 @pytest.mark.parametrize(
     ("heading", "row", "first", "step"),
     [
         ("timestamp\n", "{s:.6f}", 1.7e9, 0.1),
-        ("frame,timestamp\n", "{i},{s:.6f}", 1.7e9, 0.1),
         ("t [s];file\n", "{s:.6f};{i:06d}.png", 1.7e9, 0.1),
         ("", "{ns}", 1.7e9, 0.1),
-        ("#id t exposure\n", "{ns} {s:.9f} 1.2", 1.7e9, 0.1),
+        ("", "{ns0}", 0.0, 0.1),
         ("", "{i} {ns}", 1.7e9, 0.1),
         ("frame;t\n", "{n};{s:.6f}", 1.7e9, 0.1),
         ("", "2023-11-14 22:13:2{i}.500000", 1.7e9 + 0.5, 1.0),
-        *(("", row, 1.7e9, 0.1) for row in ("{i:03d}.png {s:.6f}", "{s:.6f} left/{i:03d}.png", "{i} {s:.6f} 0.004")),
+        ("", "{i:03d}.png {s:.6f}", 1.7e9, 0.1),
     ],
 )
 def test_times_as_other_programs_write_them(two_folders: Path, heading, row, first, step) -> None:
     """A heading is no row, which would shift all times by one; nanoseconds are no seconds."""
-    rows = [row.format(i=i, n=i + 100, s=1.7e9 + 0.1 * i, ns=17 * 10**17 + i * 10**8) + "\n" for i in range(6)]
+    ns = [{"ns0": i * 10**8, "ns": 17 * 10**17 + i * 10**8} for i in range(6)]
+    rows = [row.format(i=i, n=i + 100, s=1.7e9 + 0.1 * i, **ns[i]) + "\n" for i in range(6)]
     (two_folders / "times.txt").write_text(heading + "".join(rows))
     sequence = open_sequence(two_folders)
     assert np.allclose(sequence.stamps, first + step * np.arange(6), rtol=0, atol=1e-5) and len(sequence) == 6
@@ -196,22 +150,6 @@ def test_a_tolerance_and_a_rate_go_with_every_format(two_folders: Path, euroc: P
         assert np.allclose(open_sequence(f"{folder}?fps=5").stamps, 0.2 * np.arange(6))
 
 
-def test_words_for_left_and_right() -> None:
-    assert of_sides(["left_01.png", "right_01.png"]) == (["left_01.png"], ["right_01.png"])
-    assert of_sides(["0_cam0.png", "0_cam1.png", "0_cam10.png"]) == (["0_cam0.png"], ["0_cam1.png"])
-    assert of_sides(["L01.png", "R01.png"]) == (["L01.png"], ["R01.png"])
-    assert of_sides(["a_leftImg8bit.png", "a_rightImg8bit.png"]) == (["a_leftImg8bit.png"], ["a_rightImg8bit.png"])
-    assert of_sides(["brightness.png", "leftover.png"]) is of_sides(["HALL_1.png", "DOOR_1.png"]) is None
-    assert keys_of([["a.png", "b.png"]]) is None
-
-
-def test_numbered_images_of_one_camera_are_no_pair(tmp_path: Path) -> None:
-    for k in range(6):
-        (tmp_path / f"cam{k}.png").write_text("")
-    with pytest.raises(SequenceError, match="no sequence of a known format"):
-        open_sequence(tmp_path)
-
-
 def test_times_and_rate_can_be_told(two_folders: Path) -> None:
     assert np.allclose(open_sequence(f"{two_folders}?fps=20").stamps, 0.05 * np.arange(6))
     (two_folders / "t.txt").write_text("".join(f"{7 + 0.3 * i}\n" for i in range(6)))
@@ -222,40 +160,14 @@ def test_times_and_rate_can_be_told(two_folders: Path) -> None:
     assert np.allclose(open_sequence(two_folders).stamps, 7 + 0.3 * np.arange(1, 6))
 
 
-def test_what_is_assumed_is_said_once_and_not_above_an_error(
-    two_folders: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    said = open_sequence(two_folders).warnings
-    assert [record.getMessage() for record in caplog.records] == said
-    with said_before():
-        assert open_sequence(two_folders).warnings == said
-    assert len(caplog.records) == 1
-    next(two_folders.glob("*.y*ml")).write_text("")
-    with pytest.raises(CalibrationError):
-        open_sequence(two_folders)
-    assert len(caplog.records) == 1
-
-
-def test_kitti_s_calib_txt_beside_the_images_is_read_and_another_one_named(two_folders: Path, kitti: Path) -> None:
-    (two_folders / "calibration.yaml").unlink()
-    (two_folders / "calib.txt").write_text((kitti / "calib.txt").read_text())
-    sequence = open_sequence(two_folders)
-    assert sequence.rig.baseline == pytest.approx(0.5)
-    assert any("calib.txt: the images are taken as its cameras' 0 and 1" in line for line in sequence.warnings)
-    (two_folders / "calib.txt").write_text("cam0=[50 0 31.5; 0 50 23.5; 0 0 1]\n")
-    with pytest.raises(CalibrationError, match=r"calib\.txt: no calibration in this file"):
-        open_sequence(two_folders)
-
-
 # ------------------------------------------------------------------------------------------------ layouts
 
 
 @pytest.mark.parametrize(
     "names",
     [
-        ("image_left", "image_right"), ("camera0", "camera1"), ("infra1", "infra2"), ("cam1", "cam2"), ("L", "R"),
-        ("Left", "Right"), ("cam_left", "cam_right"), ("left_images", "right_images"), ("Camera_0", "Camera_1"),
-        ("image_lcam_front", "image_rcam_front"), ("Infrared 1", "Infrared 2"), ("ir1", "ir2"),
+        ("image_left", "image_right"), ("infra1", "infra2"), ("cam1", "cam2"), ("L", "R"), ("Camera_0", "Camera_1"),
+        ("image_lcam_front", "image_rcam_front"), ("Infrared 1", "Infrared 2"),
     ],
 )  # fmt: skip
 def test_folders_by_other_usual_names(two_folders: Path, names: tuple[str, str]) -> None:
@@ -263,16 +175,6 @@ def test_folders_by_other_usual_names(two_folders: Path, names: tuple[str, str])
         (two_folders / usual).rename(two_folders / name)
     assert seeds(open_sequence(two_folders)) == PAIRS
     assert seeds(open_sequence(f"{two_folders}?swap=yes")) == [(b, a) for a, b in PAIRS]
-
-
-@pytest.mark.parametrize("missing", ["left", "right"])
-def test_exchanged_images_without_a_partner_are_left_out_and_said(two_folders: Path, missing: str) -> None:
-    sorted((two_folders / missing).iterdir())[3].unlink()
-    sequence = open_sequence(f"{two_folders}?swap=yes&fps=10")
-    assert len(sequence) == 5 and seeds(sequence) == [(b, a) for a, b in PAIRS if a != 3]
-    assert np.allclose(sequence.stamps, [0.0, 0.1, 0.2, 0.4, 0.5])
-    (line,) = [line for line in sequence.warnings if "without a partner" in line]
-    assert line.endswith("left out")
 
 
 def test_one_folder_with_both_cameras_in_it_and_patterns(two_folders: Path) -> None:
@@ -420,20 +322,3 @@ def test_a_video_that_ends_too_early(videos: Path, build: SimpleNamespace) -> No
     run = subprocess.run([sys.executable, "-c", code, str(videos)], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == str(len(frames))
     assert run.stderr.count("\n") == 1  # our line alone (logging's last resort), none of the decoder's
-
-
-def test_faulty_videos(videos: Path, build: SimpleNamespace) -> None:
-    def refused(words: str, query: str = "", error: type[Exception] = SequenceError) -> None:
-        with pytest.raises(error, match=words):
-            open_sequence(f"{videos}{query}")
-
-    write_video(videos / "right.avi", grey(100, size=(32, 48)))
-    refused(r"differ in size: .*left\.avi is 64x48, .*right\.avi is 32x48")
-    (videos / "right.avi").write_bytes(b"hello" * 100)
-    refused(r"right\.avi: not a readable video")
-    (videos / "right.avi").unlink()
-    refused("two cameras are needed, but there is no right one")
-    build.write_image(videos / "right" / "0.png", 0)
-    refused("one is a video and the other is not")
-    write_video(videos / "other.avi", grey(1))
-    refused("option 'times' does nothing here", "?right=other.avi&times=t.txt", ConfigurationError)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import slam
 from slam.errors import CalibrationError, SequenceError
 from slam.sequences import Sequence, formats, open_sequence
 from slam.sequences.kitti import imu_poses
@@ -59,29 +58,6 @@ def test_a_range_of_frames_is_read_without_decoding_the_others(kitti: Path, buil
             sequence.frames(start, stop)
 
 
-def test_single_frames_of_recordings_and_worlds(kitti: Path, build: SimpleNamespace) -> None:
-    for sequence in (open_sequence(kitti), slam.open_sequence("synthetic:desk?frames=4&width=64&height=48")):
-        (expected,) = sequence.frames(2, 3)
-        for frame in (sequence.frame(2), sequence[np.int64(2)]):
-            assert (frame.index, frame.stamp) == (2, expected.stamp)
-            assert np.array_equal(frame.left, expected.left) and np.array_equal(frame.right, expected.right)
-        for k in (-1, 6, 1.5):
-            with pytest.raises(SequenceError, match=f"there is no frame {k}; it has"):
-                sequence[k]
-    build.cut(kitti / "image_0" / "000001.png")
-    with pytest.raises(SequenceError, match="the left image of frame 1 cannot be read"):
-        open_sequence(kitti)[1]
-
-
-def test_names_of_folders(kitti: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", str(kitti.parent))
-    monkeypatch.setenv("USERPROFILE", str(kitti.parent))
-    assert len(open_sequence("~/03")) == 6
-    odd = kitti.rename(kitti.parent / "what?")
-    assert open_sequence(odd).name == "what?"
-    assert open_sequence(f"{odd}?kind=handheld").kind == "handheld"
-
-
 # ------------------------------------------------------------------------------------------------ EuRoC
 
 
@@ -95,19 +71,6 @@ def test_euroc_rig_and_truth(euroc: Path, build: SimpleNamespace) -> None:
     assert np.allclose(truth.poses[:, :3, :3], build.T_body_camera[:3, :3])
     assert np.allclose(truth.positions[3], np.array([0.3, 0, 1]) + build.T_body_camera[:3, 3])
     assert truth.stamps[4] == sequence.stamps[1] == pytest.approx((build.T0 + build.STEP) / 1e9, abs=1e-6)
-
-
-def test_euroc_lists_of_other_kinds(euroc: Path) -> None:
-    table = euroc / "mav0" / "cam0" / "data.csv"
-    text = table.read_text().replace(",", " , ").replace("\n", "\r\n")
-    table.write_bytes(b"\xef\xbb\xbf" + text.encode())
-    for path in euroc.glob("mav0/cam*/data/*.png"):
-        cv2.imwrite(str(path.with_suffix(".jpg")), cv2.imread(str(path), 0), [cv2.IMWRITE_JPEG_QUALITY, 100])
-        path.unlink()
-    assert seeds(open_sequence(euroc)) == PAIRS  # listed as PNG, stored as JPEG
-    for cam in ("cam0", "cam1"):
-        (euroc / "mav0" / cam / "data.csv").unlink()
-    assert seeds(open_sequence(euroc)) == PAIRS  # by the names
 
 
 def test_own_images_in_euroc_s_tree(euroc: Path, build: SimpleNamespace) -> None:
@@ -187,34 +150,6 @@ def test_kitti_part_of_a_sequence_keeps_its_times_and_poses(kitti: Path) -> None
     assert sequence.warnings == [f"{kitti / 'image_0'}: no times, 10 frames per second assumed (see fps=…)"]
 
 
-@pytest.mark.parametrize(("name", "first"), [("frame_{:06d}", 0.0), ("{:d}", 0.0), ("1{:010d}00000000", 1e9)])
-def test_kitti_s_tree_with_other_names(kitti: Path, build: SimpleNamespace, name: str, first: float) -> None:
-    (kitti / "times.txt").unlink()
-    for number in (0, 1):
-        build.rename(kitti / f"image_{number}", lambda i: name.format(i) + ".png")
-    sequence = open_sequence(kitti)
-    assert seeds(sequence) == PAIRS
-    assert np.allclose(sequence.stamps, first + 0.1 * np.arange(6)) and len(sequence.ground_truth) == 6
-
-
-def test_own_images_in_a_kitti_tree(kitti: Path, raw: Path, build: SimpleNamespace) -> None:
-    """Their calibration is under one of the usual names; of a drive the images are in the cameras' folders."""
-    drive = raw.parent / "own"
-    for number in (0, 1):
-        (raw / f"image_{number:02d}" / "data").rename(drive.parent / f"{number}")
-        drive.mkdir(exist_ok=True)
-        (drive.parent / f"{number}").rename(drive / f"image_{number + 2:02d}")
-    (kitti / "calib.txt").unlink()
-    (raw.parent / "calib_cam_to_cam.txt").unlink()
-    for folder in (kitti, drive):
-        (folder / "calibration.yaml").write_text(build.FIVE)
-        sequence = open_sequence(folder)
-        assert seeds(sequence) == PAIRS and sequence.rig.baseline == pytest.approx(0.2)
-    (kitti / "calibration.yaml").rename(kitti / "my-camchain.yaml")
-    with pytest.raises(CalibrationError, match=r"is it my-camchain\.yaml\?"):
-        open_sequence(kitti)
-
-
 def write_oxts(drive: Path, records: list[str]) -> None:
     (drive / "oxts" / "data").mkdir(parents=True)
     for i, record in enumerate(records):
@@ -291,20 +226,6 @@ def test_kitti_raw_truth_keeps_a_fixed_point_where_it_is(raw: Path, colour: bool
     world = [T[:3, :3] @ x + T[:3, 3] for T, x in zip(sequence.ground_truth.poses, seen)]
     assert np.allclose(world, seen[0], atol=1e-9)
     assert not np.allclose(seen[1], seen[0], atol=0.1)
-
-
-def test_kitti_raw_with_damaged_files(raw: Path) -> None:
-    write_oxts(raw, ["49 8 110 0 0 0", "49 8 110 0 0 abc", "49 8.00001 110 0 0 0"])
-    sequence = open_sequence(raw)
-    assert len(sequence.ground_truth) == 2 and len(sequence.warnings) == 1
-    assert "0000000001.txt, row 1" in sequence.warnings[0]
-    calibration = raw.parent / "calib_cam_to_cam.txt"
-    calibration.write_text(calibration.read_text().replace("R_rect_00: 1 0 0", "R_rect_00: -1 0 0"))
-    assert "R_rect_00 is not a rigid motion" in open_sequence(raw).warnings[-1]
-    (raw.parent / "calib_imu_to_velo.txt").unlink()
-    sequence = open_sequence(raw)
-    assert sequence.ground_truth is None
-    assert "calib_imu_to_velo.txt: the calibration is missing; there is no ground truth" in sequence.warnings[-1]
 
 
 def test_kitti_tracking_as_downloaded(tmp_path: Path, build: SimpleNamespace) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import logging
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,7 +15,7 @@ import pytest
 from slam.errors import SequenceError
 from slam.sequences import open_sequence
 from slam.sequences.images import MOST_PIXELS, decode_image, read_image
-from tests.fuzz.files import png
+from tests.fuzz.mutations import png
 
 SCENE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (90, 120)).astype(np.uint8), (0, 0), 1.5)
 
@@ -44,17 +43,6 @@ def test_whole_images_are_read_and_cut_ones_refused_without_a_word(ending: str, 
         assert capfd.readouterr().err == ""
 
 
-def test_a_flipped_byte_in_a_png_is_found_by_its_checksum(tmp_path: Path) -> None:
-    data = bytearray(encoded(".png"))
-    path = tmp_path / "a.png"
-    for at in range(8, len(data) - 12, 97):
-        broken = data.copy()
-        broken[at] ^= 0x10
-        path.write_bytes(broken)
-        with pytest.raises(SequenceError, match="the image is cut off or damaged"):
-            read_image(path)
-
-
 def test_a_jpeg_with_a_preview_or_a_turned_flag(tmp_path: Path) -> None:
     """An end mark in the preview is not the image's; and a calibration is for pixels as stored."""
     data, preview = encoded(".jpg"), encoded(".jpg", SCENE[:16, :16].copy())
@@ -68,20 +56,6 @@ def test_a_jpeg_with_a_preview_or_a_turned_flag(tmp_path: Path) -> None:
             read_image(path)
 
 
-def test_what_is_no_image_at_all(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_text("hello")
-    (tmp_path / "c.png").mkdir()
-    cv2.imwrite(str(tmp_path / "d.tiff"), SCENE.astype(np.float32))
-    for name, words in (
-        ("a.png", "not a readable image"),
-        ("b.png", "there is no such file"),
-        ("c.png", ""),
-        ("d.tiff", "pixels are float32, not 8 or 16 bit"),
-    ):
-        with pytest.raises(SequenceError, match=rf"{name}: {words}"):
-            read_image(tmp_path / name)
-
-
 @pytest.mark.parametrize("size", [(8_000, 9_000), (30_000, 30_000), (2**31 - 1, 2**31 - 1), (0, 5)])
 def test_a_huge_image_is_refused_by_its_header(tmp_path, size):
     (tmp_path / "a.png").write_bytes(png(size, b""))
@@ -89,9 +63,7 @@ def test_a_huge_image_is_refused_by_its_header(tmp_path, size):
         read_image(tmp_path / "a.png")
 
 
-@pytest.mark.parametrize(
-    ("form", "channels"), [(".png", 1), (".png", 3), (".png", 4), (".tiff", 3), (".pgm", 1), (".ppm", 3)]
-)
+@pytest.mark.parametrize(("form", "channels"), [(".png", 1), (".png", 3), (".pgm", 1)])
 def test_sixteen_bits_stay_sixteen_bits(form, channels):
     pixels = np.full((6, 5, channels), 40_000, np.uint16)
     found = decode_image(cv2.imencode(form, pixels)[1].tobytes(), "x")
@@ -122,21 +94,3 @@ def test_damaged_vanished_and_other_images_cost_no_more_than_themselves(kitti: P
         "000002.png: image is 32x48, not 64x48",
     ):
         assert any(words in line for line in sequence.warnings)
-
-
-def test_many_faults_of_a_kind_are_summed_up(kitti: Path, build: SimpleNamespace, caplog) -> None:
-    for i in range(6, 40):
-        for number in (0, 1):
-            build.write_image(kitti / f"image_{number}" / f"{i:06d}.png", i % 20)
-    (kitti / "times.txt").write_text("".join(f"{0.1 * i}\n" for i in range(40)))
-    for i in range(10, 40):
-        (kitti / "image_0" / f"{i:06d}.png").write_bytes(b"not an image")
-    (kitti.parent.parent / "poses" / "03.txt").unlink()
-    sequence = open_sequence(kitti)
-    for _ in range(2):
-        caplog.clear()
-        with caplog.at_level(logging.WARNING, "slam.sequences"):
-            assert len(list(sequence)) == 10
-        assert len(caplog.records) == 6
-        assert caplog.records[-1].getMessage() == "left images unreadable, frames skipped: 30 in all, 25 not listed"
-    assert len(sequence.warnings) == 6  # kept once, though read twice

@@ -23,10 +23,10 @@ def threads():
 
 
 def test_whoever_is_fast_enough_gets_every_frame_at_its_time():
-    live, began = LiveFrames(frames(6, 0.05)), time.monotonic()
+    live, began = LiveFrames(frames(4, 0.25)), time.monotonic()
     taken = [(frame.index, time.monotonic() - began) for frame in live]
-    assert [index for index, _ in taken] == list(range(6))
-    assert all(when >= 0.05 * index for index, when in taken)
+    assert [index for index, _ in taken] == list(range(4))
+    assert all(when >= 0.25 * index for index, when in taken)
     assert live.dropped == 0 and not live.ended_early and not threads()
 
 
@@ -38,39 +38,6 @@ def test_whoever_is_too_slow_gets_the_newest_and_what_is_left_out_is_counted():
         assert live.age(frame) >= 0.05
     assert indices == sorted(indices) and indices[-1] == 99 and 3 < len(indices) < 50
     assert live.dropped == 100 - len(indices)
-
-
-def test_a_frame_is_the_newest_when_it_is_taken():
-    taken, all_given, looked = threading.Event(), threading.Event(), threading.Event()
-
-    def camera():
-        first, *others = frames(5)
-        yield first
-        taken.wait(10)
-        yield from others
-        all_given.set()
-        looked.wait(10)
-
-    live = LiveFrames(camera(), paced=False)
-    taking = iter(live)
-    assert next(taking).index == 0
-    taken.set()
-    assert all_given.wait(10)
-    assert next(taking).index == 4
-    assert live.dropped == 3
-    looked.set()
-    assert list(taking) == []
-
-
-def test_a_clock_waits_for_slow_reading():
-    def slow():
-        for frame in frames(5, 0.001):
-            time.sleep(0.03)
-            yield frame
-
-    live = LiveFrames(slow())
-    assert [frame.index for frame in live] == list(range(5))
-    assert live.clock_waited > 0.1 and live.dropped == 0
 
 
 def test_it_ends_while_no_frame_comes_although_the_driver_is_stuck(monkeypatch):

@@ -43,15 +43,6 @@ def test_a_feature_of_another_landmark_s_track_or_of_none_begins_a_row():
     assert tracks.found.tolist() == [True, True, False, False]  # the new rows are not followed yet
 
 
-def test_what_leaves_the_map_is_followed_on_and_what_is_lost_from_view_stays_in_the_map():
-    tracks = followed(2)
-    tracks.enter_landmarks(0, np.array([5, 6]), features(2), np.array([0, 1]), HERE)
-    tracks.erase_landmarks(np.array([0]))
-    tracks.give_up(np.array([1]))
-    assert tracks.ids[:2].tolist() == [-1, 6] and tracks.number[:2].tolist() == [100, -1]
-    assert tracks.used.tolist() == [True, True, False, False]
-
-
 def test_a_frame_s_copy_has_room_and_leaves_the_landmarks_of_the_frame_before_as_they_were():
     tracks = followed(2)
     tracks.enter_landmarks(0, np.array([5, 6]), features(2), np.array([0, 1]), HERE)

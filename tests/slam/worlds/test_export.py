@@ -50,11 +50,3 @@ def test_a_folder_is_not_overwritten_and_recordings_are_refused(written, tmp_pat
     ):
         with pytest.raises(SequenceError, match=words):
             write_euroc(what, where, *frames)
-
-
-def test_a_folder_whose_name_is_no_utf8(tmp_path):
-    """OpenCV ends the process where it is given such a name."""
-    sequence = open_world("box?frames=2&width=96&height=72")
-    write_euroc(sequence, tmp_path / "\udc80", 0, 1)
-    again = next(iter(open_sequence(tmp_path / "\udc80")))
-    np.testing.assert_array_equal(again.left, sequence.frame(0).left)

@@ -98,11 +98,3 @@ def test_only_what_the_camera_sees_is_visible():
         assert same.mean() > 0.97
         on_objects = sequence.landmarks.object[truth.ids] > 0
         assert 10 < on_objects.sum() < len(truth.ids)
-
-
-def test_faults_take_features_away():
-    sequence = open_world("aisle?black=3&dropright=4")
-    counts = [len(sequence.observations(k)) for k in range(5)]
-    assert counts[3] == 0 < counts[4]
-    assert not sequence.observations(4).has_stereo.any()
-    assert len(sequence.observations(3).descriptors) == 0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from slam import worlds
-from slam.errors import SequenceError, SlamError
+from slam.errors import SlamError
 
 
 @pytest.mark.parametrize(
@@ -26,16 +26,6 @@ def test_what_is_asked_for_wrongly_is_refused_in_one_line(text, message):
     with pytest.raises(SlamError, match=message) as caught:
         worlds.open_world(text)
     assert "\n" not in str(caught.value)
-
-
-def test_frames_outside_the_recording_are_refused():
-    sequence = worlds.open_world("box?frames=5")
-    assert len(list(sequence.frames(4, 9))) == 1
-    assert sequence.warnings == ["box?frames=5: frames 4:9 asked for, it has 5"]
-    with pytest.raises(SequenceError, match="there is no frame 5; it has 5"):
-        sequence.observations(5)
-    with pytest.raises(SequenceError, match="frames 5: asked for"):
-        sequence.frames(5)
 
 
 def test_faults_by_number_range_and_chance():

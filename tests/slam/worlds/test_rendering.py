@@ -100,19 +100,7 @@ def test_rendering_twice_gives_the_same_bytes_whatever_the_order_and_the_threads
 
 
 def test_no_pixel_of_a_room_is_without_a_surface():
-    for query in ("aisle", "desk", "field", "boxes"):
+    for query in ("aisle", "desk", "boxes"):
         sequence = open_world(query)
         for k in np.linspace(0, len(sequence) - 1, 5).astype(int):
             assert (sequence.depth(k) > 0).all(), query
-
-
-@pytest.mark.parametrize("frame", [20, 150])
-def test_the_aisle_gives_surf_what_paper_a_s_camera_gave(frame):
-    """Paper A, III.A: 837 features at a D_threshold of 0, 41 at 10000, with two octaves on a 320x240 image."""
-    from frontends.surf import Surf
-
-    image = open_world("aisle?frames=200").frame(frame).left
-    counts = [len(Surf(threshold=t, octaves=2).detect(image)) for t in (0, 2550, 10000)]
-    assert 600 < counts[0] < 1200
-    assert 150 < counts[1] < 500
-    assert 15 < counts[2] < 100  # the letters on the spines are OpenCV's, whose fonts changed in version 5

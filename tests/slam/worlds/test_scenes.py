@@ -48,14 +48,6 @@ def test_the_aisle_is_paper_a_s():
     assert (forward[:, 0] > 0.3).all() and (forward[:, 1] > 0.3).all(), "along the shelves and towards them"
 
 
-def test_startup_camera_stands_where_paper_b_says_and_the_board_faces_it():
-    sequence = open_world("startup")
-    assert np.allclose(sequence.ground_truth.positions, indoors.CAMERA, atol=0.01)  # a robot stands there, and trembles
-    on_board = sequence.landmarks.surface == 0
-    assert on_board.sum() == 24
-    assert np.abs(sequence.landmarks.positions[on_board, 1]).max() < 1e-12
-
-
 def test_box_stands_at_the_places_of_table_1():
     sequence = open_world("box")
     pause = round((indoors.REST + indoors.MOVE) * 30)

@@ -1,13 +1,11 @@
-"""Runs whose files cannot all be written: full disks, devices, folders in use, and frames that cannot be had."""
+"""For runs whose files cannot all be written: a sequence that breaks, a full disk, and whether files are whole."""
 
 from __future__ import annotations
 
 import csv
 import json
-import os
 import resource
 import signal
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,18 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from slam.atlas.map_io import load_map
-from slam.config import SystemConfig
 from slam.data import StereoFeatures, StereoFrame
-from slam.errors import SequenceError, SlamError
 from slam.geometry.trajectory import Trajectory
-from slam.run.options import RunOptions
 from slam.run.outputs import FRAME_COLUMNS
 from slam.run.recording import load_recording
-from slam.run.runner import run
-from slam.sequences.base import Sequence
-from tests.fuzz.harness import Broken, Subject, require_line
-from tests.fuzz.hostile import choose
-from tests.fuzz.settings import scene
+from tests.fuzz.harness import Broken, scene
 
 FRAMES = 5
 
@@ -57,56 +48,6 @@ class Features:
 
     def extract(self, frame: StereoFrame) -> StereoFeatures:
         return scene()[1][frame.index]
-
-
-class Interrupted(BaseException):
-    """As Ctrl-C, but of ours."""
-
-
-def write_run(rng: np.random.Generator, folder: Path) -> None:
-    """A run that stops somewhere, on a disk that is full somewhere, or with something in its way."""
-    out = folder / "out"
-    record, known = folder / "a.npz", folder / "a.map"
-    if rng.random() < 0.3:
-        _obstruct(rng, out, record, known)
-    error = choose(rng, (None, None, None, SequenceError("a frame is missing"), Interrupted()))
-    size = int(choose(rng, (0, 1, 100, 1000, 2000, 4000, 8000, 30_000, 10**6))) if rng.random() < 0.6 else None
-    before = {p: _kind(p) for p in (record, known)}
-    sequence: Sequence = Scripted(error, int(rng.integers(FRAMES + 1)))  # type: ignore[assignment]
-    backend = choose(rng, ("ekf", "smoother"))
-    options = RunOptions(backend, "none", SystemConfig(), out, record=record, save_map=known)
-    raised: BaseException | None = None
-    try:
-        with disk_of(size):
-            run(sequence, options, frontend=Features())  # type: ignore[arg-type]
-    except (SlamError, Interrupted) as caught:
-        raised = caught
-    if isinstance(raised, SlamError):
-        require_line(raised)
-    if raised is None and size is not None and not (out / "summary.json").exists():
-        raise Broken("a run without a summary ends well")
-    for path, kind in before.items():
-        if kind not in (None, stat.S_IFREG) and _kind(path) != kind:
-            raise Broken("a device or a pipe was replaced")
-    require_whole(folder, out)
-
-
-def _obstruct(rng: np.random.Generator, out: Path, record: Path, known: Path) -> None:
-    """Something where a file is to be written."""
-    path = choose(rng, (record, known, out, *(out / n for n in ("trajectory.txt", "summary.json", "landmarks.csv"))))
-    path.parent.mkdir(exist_ok=True)
-    obstacles = (
-        lambda: os.mkfifo(path), lambda: (path / "x").mkdir(parents=True), lambda: path.symlink_to("/dev/full"),
-        lambda: path.symlink_to("nowhere/at/all"),
-    )  # fmt: skip
-    choose(rng, obstacles)()
-
-
-def _kind(path: Path) -> int | None:
-    try:
-        return stat.S_IFMT(path.lstat().st_mode)
-    except OSError:
-        return None
 
 
 @contextmanager
@@ -148,6 +89,3 @@ def _require_whole_rows(path: Path) -> None:
     with path.open(newline="") as file:
         if any(len(row) != len(FRAME_COLUMNS) for row in csv.reader(file)):
             raise Broken("a row is there in part")
-
-
-SUBJECTS = (Subject("files of a run", write_run, quiet=False, short=40),)

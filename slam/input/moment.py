@@ -1,0 +1,100 @@
+"""Whether left and right images are of one moment, by rows of their features that follow the motion."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.data import StereoFeatures
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, inverse, transform
+
+_LAG, _SIGMAS = 0.1, 5.0  # guard: lag of the right images [frames] that counts, and in standard deviations
+_LEAST, _MOST = 15, 64  # guard: blocks of frames of which a lag is taken; cost: that are kept apart
+_FLOW = 4.0  # guard: flow [px] beyond which rows would differ by more than they are matched with
+
+
+class MomentWatch:
+    """The lag of the right images, in frames, from the features and poses of successive frames.
+
+    It is the regression of vertical disparities on the flow along columns from the frame before; how early they are,
+    on that from the frame after. What errors of the calibration explain, which are the same in all frames, is taken
+    out of both first: a camera that drives straight on moves rows in one way, too. Sums are kept of blocks of frames,
+    which are merged two by two when there are too many. `rig` is the rectified pair.
+    """
+
+    def __init__(self, rig: StereoRig) -> None:
+        self._rig = rig
+        self._before: tuple[Array, Array] | None = None  # pose and features of the last frame, if that was measured
+        self._blocks: list[Array] = []  # sums of products (2, 7, 7) [px²], late and early, see `_products`
+        self._length, self._in_last = 1, 1  # frames of a block, and of the last one
+
+    def add(self, features: StereoFeatures, T_world_left: Array, measured: bool) -> None:
+        """Take in a frame: features in rectified pixels, not corrected, and the pose (4, 4), if it was `measured`."""
+        if not measured:
+            self._before = None
+            return
+        before, self._before = self._before, (T_world_left, self._points(features))
+        if before is None:
+            return
+        step = inverse(before[0]) @ T_world_left
+        sums = np.stack([self._products(self._before[1], step), self._products(before[1], inverse(step))])
+        if self._blocks and self._in_last < self._length:
+            self._blocks[-1] = self._blocks[-1] + sums
+            self._in_last += 1
+            return
+        if len(self._blocks) == _MOST:
+            self._blocks = [a + b for a, b in zip(self._blocks[::2], self._blocks[1::2])]
+            self._length *= 2
+        self._blocks.append(sums)
+        self._in_last = 1
+
+    @property
+    def doubt(self) -> str:
+        """What to say where rows differ as they do between images of two moments; empty where they do not."""
+        found = {"": _LAG}
+        for word, sums in zip(("late", "early"), np.array(self._blocks).reshape(-1, 2, 7, 7).swapaxes(0, 1)):
+            while len(sums) >= _LEAST:  # of all frames, of the last half, … : an image may be missing in the middle
+                whole = sums.sum(axis=0)
+                less = np.concatenate([np.eye(2), -np.linalg.lstsq(whole[2:, 2:], whole[2:, :2], rcond=None)[0]])
+                products, squares = (less.T @ sums @ less)[:, :, 1].T
+                lag = -products.sum() / max(squares.sum(), np.finfo(float).tiny)
+                if lag * squares.sum() > _SIGMAS * np.sqrt(np.square(products + lag * squares).sum()):
+                    found[word] = max(lag, found.get(word, 0.0))
+                sums = sums[len(sums) // 2 :]
+        word = max(found, key=lambda word: found[word])
+        return word and (
+            "left and right image are not of one moment: rows of their features differ with the motion, as if right "
+            f"images were {word} by a part of a frame or more; pair them by their times or numbers, and let one camera "
+            "trigger the other"
+        )
+
+    def _points(self, features: StereoFeatures) -> Array:
+        """Of each feature with a right pixel (N, 5): its point in the camera's axes [m], row, vertical disparity."""
+        rows = np.flatnonzero(features.has_stereo)
+        left, right = features.uv_left[rows], features.uv_right[rows]
+        with np.errstate(all="ignore"):
+            points = self._rig.triangulate(left, np.column_stack([right[:, 0], left[:, 1]]))
+        return np.column_stack([points, left[:, 1], right[:, 1] - left[:, 1]])
+
+    def _products(self, seen: Array, T_other_now: Array) -> Array:
+        """Sums of products (7, 7) [px²] over features: of vertical disparities, of the flow, and of `_fields`.
+
+        The flow is how many rows a still point moves in the left image from another frame to this one; `T_other_now`
+        (4, 4) takes this frame's camera coordinates to the other's. A right image from between them is off by a share
+        of it.
+        """
+        with np.errstate(all="ignore"):
+            flow = seen[:, 3] - self._rig.left.project(transform(T_other_now, seen[:, :3]))[:, 1]
+            columns = np.column_stack([seen[:, 4], flow, *_fields(seen[:, :3])])
+        columns = columns[np.isfinite(columns).all(axis=1) & (np.abs(flow) < _FLOW)]
+        return np.asarray(columns.T @ columns)
+
+
+def _fields(points: Array) -> tuple[Array, ...]:
+    """How vertical disparities (N,) of points in the camera's axes may be off by the calibration, up to factors.
+
+    A right camera that is turned by a small angle, of another focal length or principal point, or higher or lower.
+    """
+    x, y, z = points.T
+    x, y, one = x / z, y / z, np.ones(len(points))
+    return one, x, y, x * y, one / z
