@@ -101,10 +101,10 @@ class Scene:
 
 def moved_in(body: Body | None, tracks: Tracks, rows: IndexArray, frame: Frame) -> Displacements:
     """How far tracks (N,) went in the world, or in the axes of a body, about whose origin their points are then."""
-    t, ages, eyes, slide = tracks, frame.ages, frame.poses[:, :3, 3], frame.setup.slide
+    t, ages, eyes = tracks, frame.ages, np.ascontiguousarray(frame.poses[:, :3, 3])
     rays = t.position[rows] - frame.eye
     if body is None:
-        return Displacements(rays, *displaced(t.A, t.p, t.dof, rows, ages, _RECENT, rays, eyes, slide))
+        return Displacements(rays, *displaced(t.A, t.p, t.dof, rows, ages, _RECENT, rays, eyes, frame.setup.slide))
     points, A, known = in_body_axes(body, tracks, rows)
     dof, points = np.where(known, t.dof[rows], 0).astype(np.int8), np.where(known[..., None], points, 0.0)
     inside = (t.position[rows] - body.T[:3, 3]) @ body.T[:3, :3]
