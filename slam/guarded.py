@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from inspect import Parameter, signature
 from typing import Any
@@ -24,7 +24,8 @@ def guarded(backend: Any) -> Any:
     Refused, and nothing changed, are options that its constructor does not name, stamps that do not increase, calls
     before the first `predict`, ids that are not in the map, or to be added and in it, new landmarks without a depth, a
     second update of a stamp or one after an `add`, and guesses that are no pose. An update without rows is EMPTY.
-    Answers are copies: what the caller writes into them does not reach the back end.
+    Answers are copies: what the caller writes into them does not reach the back end. Of its additional methods those
+    that move the camera or the map count here, too; but what these are given, it checks itself.
     """
     name, parameters = backend.__name__, signature(backend).parameters.values()
     any_option = any(p.kind is Parameter.VAR_KEYWORD for p in parameters)
@@ -53,8 +54,14 @@ def guarded(backend: Any) -> Any:
             return numbers
 
         def predict(self, stamp: float) -> Prediction:
+            return self._to(stamp, self._backend.predict)
+
+        def predict_at_rest(self, stamp: float) -> Prediction:
+            return self._to(stamp, self._backend.predict_at_rest)
+
+        def _to(self, stamp: float, predict: Callable[[float], Prediction]) -> Prediction:
             require_stamp(name, stamp, None if np.isnan(self._stamp) else self._stamp)
-            found: Prediction = deepcopy(self._backend.predict(float(stamp)))
+            found = deepcopy(predict(float(stamp)))
             self._stamp, self._measured = float(stamp), False
             return found
 
@@ -63,9 +70,13 @@ def guarded(backend: Any) -> Any:
             require_not_measured(name, self._measured)
             require_guess(name, guess)
             report = UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
-            report = self._backend.update(observations, guess) if len(observations) else report
+            report = deepcopy(self._backend.update(observations, guess)) if len(observations) else report
             self._measured = True
             return report
+
+        def revise(self, correct: Callable[[Array], Array]) -> None:
+            self._backend.revise(correct)
+            self._measured = True
 
         def add(self, observations: Observations) -> None:
             ids = self._require(observations.ids, known=False)
@@ -75,14 +86,22 @@ def guarded(backend: Any) -> Any:
                 self._backend.add(observations)
                 self._ids, self._measured = self._ids | set(ids), True
 
+        def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
+            self._backend.insert(ids, positions, covariances)
+            self._ids = self._ids | set(np.asarray(ids).tolist())
+
+        def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
+            self._require(ids, known=False)
+            self._backend.place(ids, local, covariances)
+            self._ids, self._measured = self._ids | set(np.asarray(ids).tolist()), True
+
         def remove(self, ids: IdArray | Sequence[int]) -> None:
             gone = self._require(ids)
             self._backend.remove(np.array(gone, np.int64))
             self._ids = self._ids - set(gone)
 
         def positions(self, ids: IdArray) -> Array:
-            self._require(ids)
-            found: Array = deepcopy(self._backend.positions(ids))
+            found: Array = deepcopy(self._backend.positions(np.array(self._require(ids), np.int64)))
             return found
 
         def estimate(self, landmarks: bool = True) -> Estimate:
@@ -94,6 +113,11 @@ def guarded(backend: Any) -> Any:
             found: Trajectory = deepcopy(self._backend.trajectory())
             return found
 
-    for attribute in ("__name__", "__qualname__", "__module__", "__doc__"):  # it is found and named as that class
-        setattr(Guarded, attribute, getattr(backend, attribute))
+    own = {key: getattr(backend, key) for key in ("__name__", "__qualname__", "__module__", "__doc__")}
+    for attribute, value in {**own, "__wrapped__": backend}.items():  # it is found and named as that class
+        setattr(Guarded, attribute, value)
+    backend.__qualname__ += ".__wrapped__"  # where pickle finds it
+    for attribute in ("predict_at_rest", "revise", "insert", "place"):
+        if not hasattr(backend, attribute):
+            delattr(Guarded, attribute)
     return Guarded

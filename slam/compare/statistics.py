@@ -64,6 +64,8 @@ def difference(metric: Metric, reference: Array, other: Array, tests: int = 1) -
     d = compared[1] - compared[0]
     first, second, mean = (float(each.mean()) if len(d) else float("nan") for each in (*values, d))
     half = reach(len(d), tests) * float(d.std(ddof=1)) if len(d) > 1 else float("nan")
+    if len(d) > 1 and mean and (d == d[0]).all() and 2.0 ** len(d) < 2 * tests / (1 - LEVEL):
+        half = float("inf")  # counts that are all alike have no spread; by their signs alone it may be chance
     return Difference(metric, len(d), int((~both).sum()), first, second, mean, mean - half, mean + half)
 
 

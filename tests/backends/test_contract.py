@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +13,10 @@ import pytest
 import backends
 from backends.ekf import EkfBackend
 from slam import registry
+from slam.data import Observations
 from slam.errors import MeasurementError
-from slam.interfaces import Backend
+from slam.guarded import guarded
+from slam.interfaces import Backend, MapBackend, RestingBackend, RevisingBackend
 from slam.testing import BACKEND_CHECKS, RIG, RUNS, check_backend, findings
 from slam.testing.__main__ import main
 from tests.backends.hostile_calls import play
@@ -39,6 +42,44 @@ def test_contract(name, check):
 @pytest.mark.parametrize("check", BACKEND_CHECKS, ids=by_name)
 def test_the_filter_of_the_docs_passes_the_whole_contract(check):
     check(load_script("docs/examples/small_filter.py").SmallFilter)
+
+
+class Guarded(EkfBackend):
+    """Stands for one of somebody's own that has all additional methods, and refuses nothing itself."""
+
+    def __init__(self, rig, models=None, mine=3):
+        super().__init__(rig, models)
+
+    def update(self, observations, guess=None):
+        self.report = super().update(observations, guess)
+        return self.report
+
+
+Guarded = guarded(Guarded)
+
+
+def test_a_guarded_back_end_keeps_count_of_its_additional_methods_and_gives_nothing_away():
+    assert registry.options_of(Guarded, RIG) == {"mine": (3, Guarded)}
+    backend, z = Guarded(RIG), RIG.project_stereo(np.array([[0.0, 0.0, 5.0]]))[0]
+    seen = Observations(np.array([3]), z[:, :2], z[:, [2, 1]])
+    backend.insert(np.array([3]), np.array([[0.0, 0.0, 5.0]]), 1e-2 * np.eye(3)[None])
+    backend.predict(0.0)
+    assert backend.positions([3]).shape == (1, 3)  # ids in any form
+    backend.predict_at_rest(1.0)
+    with pytest.raises(MeasurementError, match="increase"):
+        backend.predict(0.5)
+    report = backend.update(seen)
+    report.used[:] = 7
+    assert backend.report.used.tolist() == [3]
+    backend.predict(2.0)
+    backend.place(np.array([4]), np.array([[0.0, 0.0, 4.0]]), 1e-2 * np.eye(3)[None])
+    with pytest.raises(MeasurementError, match="one update"):
+        backend.update(seen)
+    with pytest.raises(MeasurementError, match="already"):
+        backend.add(replace(seen, ids=np.array([4])))
+    assert pickle.loads(pickle.dumps(backend)).estimate().ids.tolist() == [3, 4]
+    small = load_script("docs/examples/small_filter.py").SmallFilter(RIG)
+    assert isinstance(backend, MapBackend) and not isinstance(small, MapBackend | RestingBackend | RevisingBackend)
 
 
 class Own(EkfBackend):

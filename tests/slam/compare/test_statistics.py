@@ -6,7 +6,7 @@ import pytest
 from slam.compare.statistics import difference, reach
 from slam.run.results import BY_KEY
 
-ATE, NEES, TRACKED = BY_KEY["ate_online_m"], BY_KEY["nees_per_dof"], BY_KEY["tracked"]
+ATE, NEES, TRACKED, DOUBTED = (BY_KEY[key] for key in ("ate_online_m", "nees_per_dof", "tracked", "doubted"))
 
 
 def pairs(n):
@@ -26,6 +26,8 @@ def test_verdicts():
         (ATE, first, first, "equal"),
         (ATE, first[:1], first[:1], "equal"),
         (ATE, first[:1], second[:1], "one trial"),
+        (DOUBTED, np.zeros(2), np.ones(2), "open"),  # all alike, and yet by chance in half of all cases
+        (DOUBTED, np.zeros(6), np.ones(6), "worse"),
         (ATE, first, np.full(6, np.nan), ""),
         (BY_KEY["map_size"], first, second, ""),
     ):
