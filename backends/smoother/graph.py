@@ -70,10 +70,8 @@ class Graph:
         self._number, self._taken = -1, 0
         self._base: Array = np.zeros((6, 6))  # what is known of the first pose, besides its prior
         self._poses: dict[int, Array] = {}
-        self._first, self._to_state = (
-            np.eye(4),
-            np.eye(4),
-        )  # the first pose; what takes gtsam's coordinates to the state's
+        self._first = np.eye(4)  # the first pose
+        self._to_state = np.eye(4)  # takes gtsam's coordinates to the state's
         self._kind = False, 0
         self._tie: Tie | None = None  # of its newest pose
 

@@ -34,10 +34,10 @@ _STAMP = re.compile(
 )
 _SECONDS = re.compile(r"(-?\d{1,10})[.,](\d{1,9})", re.ASCII)  # a whole name
 _DATE = re.compile(r"(?<!\d)20\d\d[-_.]?[01]\d[-_.]?[0-3]\d(?!\d)", re.ASCII)  # what follows is a time of day
-# A date and time down to milli-, micro- or nanoseconds.
+# A date and time, down to milli-, micro- or nanoseconds.
 _MOMENT = re.compile(
     r"(?<!\d)(20\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[-_T ]?([0-2]\d)[-_:.h]?([0-5]\d)[-_:.m]?([0-5]\d)"
-    r"[-_.s]?(\d{9}|\d{6}|\d{3})(?!\d)",
+    r"(?:[-_.s]?(\d{9}|\d{6}|\d{3}))?(?![.,]?\d)",
     re.ASCII,
 )
 _NUMBER = re.compile(r"\d+", re.ASCII)
@@ -92,9 +92,9 @@ def keys_of(sides: Sequence[Sequence[str]]) -> Keys | None:
     """What the names of each camera's images say; None where neither stamps nor numbers tell the images apart.
 
     A stamp is 19 digits (nanoseconds), 16 (microseconds), 13 (milliseconds), 10 (seconds), the last two also with a
-    fraction, or a date and time with its fraction, anywhere in the names; or numbers so far apart that they cannot
-    count frames. A frame's number is the one that differs from name to name; of several, those that both cameras share,
-    and that count best.
+    fraction, or a date and time, of whole seconds over several minutes, anywhere in the names; or numbers so far apart
+    that they cannot count frames. A frame's number is the one that differs from name to name; of several, those that
+    both cameras share, and that count best.
     """
     stems = [[stem(name) for name in names] for names in sides]
     for read in (_moments, _stamps):
@@ -135,12 +135,14 @@ def _stamps(names: Sequence[str]) -> IntArray | None:
 def _moments(names: Sequence[str]) -> IntArray | None:
     """Dates and times [ns since 1970] that every name has and that tell the names apart."""
     for found in zip(*(_MOMENT.finditer(name) for name in names)):  # the session's may stand before the image's
+        if not all(match[7] for match in found) and len({match.groups()[:5] for match in found}) == 1:
+            continue  # whole seconds, or a count: within a minute they are in one order
         whole = ["{}-{}-{}T{}:{}:{}".format(*match.groups()) for match in found]
         try:
             keys = np.array(whole, "datetime64[ns]").astype(np.int64)
         except ValueError:  # no date
             continue
-        keys += np.array([int(match[7].ljust(9, "0")) for match in found], np.int64)
+        keys += np.array([int((match[7] or "0").ljust(9, "0")) for match in found], np.int64)
         if len(set(keys)) == len(names) and median(_steps(keys.tolist()) or [np.inf]) > _SHORTEST:  # else they count
             return np.asarray(keys)
     return None

@@ -34,6 +34,7 @@ NAMES = {  # of the left and the right images, and the stamps that they say; pla
     "whole seconds": ("{}", "{}", lambda i: 1_600_000_000 + i, 1.6e9, 1.0),
     "ISO": ("2023-04-05T12:00:{:02d}.250000Z",) * 2 + (lambda i: i, 1680696000.25, 1.0),
     "date and time": ("20230405_120000_{:03d}",) * 2 + (lambda i: 90 * i, 1680696000, 0.09),
+    "seconds of minutes": ("20230405_12{0[0]:02d}{0[1]:02d}",) * 2 + (lambda i: divmod(57 + i, 60), 1680696057, 1.0),
     "two dates": ("2018-07-09-16-11-56_2018-07-09-16-11-5{0[0]}-{0[1]:03d}",) * 2
     + (lambda i: divmod(6700 + 110 * i, 1000), 1531152716.7, 0.11),
     "date of the session": ("20230405_120000_{:03d}",) * 2 + (lambda i: i, 0.0, 0.1),
