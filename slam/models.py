@@ -80,8 +80,8 @@ class ObjectModels:
         points: largest number of points estimated per body; those unseen for longest make room for new ones.
         max_speed, max_acceleration, max_turn_rate: limits of any body's motion [m/s], [m/s²], [rad/s]; an estimate
             beyond them is refused. The acceleration is that of a collision.
-        drift: density of the random walk of a point's pixel, in both images alike, with the angle from which it is seen
-            [px / √rad]: from another viewpoint, a feature is found at another point of the body.
+        drift: density of the random walk of a feature's pixel, in both images alike, with the angle from which it is
+            seen [px / √rad]: from another viewpoint it is at another point of a still surface, which seems to move.
 
     Raises:
         ConfigurationError: a number is not positive and finite, or fewer than three points are allowed.
