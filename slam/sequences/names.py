@@ -28,7 +28,7 @@ _SHORTEST_MICRO = 10**4  # [µs] between frames: a hundred a second; no count of
 # Since 1973: seconds with a fraction, nano-, micro-, milliseconds, these with a fraction, too, or whole seconds; or
 # seconds since a start.
 _STAMP = re.compile(
-    r"(?<!\d)(?<!\d[.,])(?:([1-9]\d{8,9})[.,](\d{1,9})|([1-9]\d{17,18})|([1-9]\d{15})|([1-9]\d{12}(?:[.,]\d{1,6})?)"
+    r"(?<!\d)(?<!\d[.,])(?:([1-9]\d{8,9})(?:[.,]|[_-](?=(?:\d{6}|\d{9})(?!\d)))(\d{1,9})|([1-9]\d{17,18})|([1-9]\d{15})|([1-9]\d{12}(?:[.,]\d{1,6})?)"
     r"|([12]\d{9})|(\d{1,10})[.,](\d{1,9}))(?!\d|[.,]\d)",
     re.ASCII,
 )
@@ -126,8 +126,8 @@ def _stamps(names: Sequence[str]) -> IntArray | None:
                 continue  # seconds of a time of day, an exposure
         widths = (0, 6 if max(lengths) <= 6 else 9) if len(lengths) > 1 else (0,)
         keys = min(([_nanoseconds(part, width) for part in parts] for width in widths), key=_unevenness)
-        far = len(keys) > 1 and median(_steps(keys)) > _LONGEST  # a clock from its start, in a finer unit
-        if not far and max(keys) <= MOST_NANOSECONDS and len(set(keys)) == len(keys):
+        step = median(_steps(keys) or [_LONGEST])  # beyond: a clock from its start, in a finer unit; below: a count
+        if _SHORTEST < step <= _LONGEST and max(keys) <= MOST_NANOSECONDS and len(set(keys)) == len(keys):
             return np.array(keys, np.int64)
     return None
 

@@ -73,8 +73,9 @@ def read_times(path: Path, faults: FaultLog) -> tuple[Array, list[str]]:
     if counts and (np.diff(second) > 0).all():
         faults.report("times", f"{path}: the first number of each row counts rows; the second one is taken as time")
         times = second
-    step = np.median([0.0, *np.abs(np.diff(times[np.isfinite(times)]))])
-    if step > _SLOWEST:  # in the unit in which they are those of a camera
+    told = times[np.isfinite(times)]
+    since_1970 = len(told) > 0 and SINCE_1970[0] <= told[0] <= SINCE_1970[1]  # seconds, however far apart
+    if not since_1970 and (step := np.median([0.0, *np.abs(np.diff(told))])) > _SLOWEST:  # as a camera's in that unit
         unit, size = min(UNITS, key=lambda one: abs(np.log(step / one[1] / _USUAL)))
         faults.report("times", f"{path}: the times are taken as {unit}")
         times = times / size

@@ -33,6 +33,9 @@ NAMES = {  # of the left and the right images, and the stamps that they say; pla
     "unpadded": ("c-1700000000.{}", "c-1700000000.{}", lambda i: 97000 + 1500 * i, 1.7e9 + 0.097, 0.0015),
     "whole seconds": ("{}", "{}", lambda i: 1_600_000_000 + i, 1.6e9, 1.0),
     "ISO": ("2023-04-05T12:00:{:02d}.250000Z",) * 2 + (lambda i: i, 1680696000.25, 1.0),
+    "seconds and nanoseconds": ("{0[0]}_{0[1]:09d}",) * 2
+    + (lambda i: divmod(1_403_636_579_900_000_000 + i * 50_000_000, 10**9), 1403636579.9, 0.05),
+    "seconds and a count": ("1600000000_{:06d}",) * 2 + (lambda i: 3 + i, 0.0, 0.1),
     "date and time": ("20230405_120000_{:03d}",) * 2 + (lambda i: 90 * i, 1680696000, 0.09),
     "seconds of minutes": ("20230405_12{0[0]:02d}{0[1]:02d}",) * 2 + (lambda i: divmod(57 + i, 60), 1680696057, 1.0),
     "two dates": ("2018-07-09-16-11-56_2018-07-09-16-11-5{0[0]}-{0[1]:03d}",) * 2
@@ -87,6 +90,7 @@ def test_a_guess_is_said_with_what_was_guessed(two_folders: Path) -> None:
         ("t [s];file\n", "{s:.6f};{i:06d}.png", 1.7e9, 0.1),
         ("", "{ns}", 1.7e9, 0.1),
         ("", "{ns0}", 0.0, 0.1),
+        ("", "{slow}", 1.7e9, 20.0),
         ("", "{i} {ns}", 1.7e9, 0.1),
         ("frame;t\n", "{n};{s:.6f}", 1.7e9, 0.1),
         ("", "2023-11-14 22:13:2{i}.500000", 1.7e9 + 0.5, 1.0),
@@ -95,7 +99,7 @@ def test_a_guess_is_said_with_what_was_guessed(two_folders: Path) -> None:
 )
 def test_times_as_other_programs_write_them(two_folders: Path, heading, row, first, step) -> None:
     """A heading is no row, which would shift all times by one; nanoseconds are no seconds."""
-    ns = [{"ns0": i * 10**8, "ns": 17 * 10**17 + i * 10**8} for i in range(6)]
+    ns = [{"ns0": i * 10**8, "ns": 17 * 10**17 + i * 10**8, "slow": 1_700_000_000 + 20 * i} for i in range(6)]
     rows = [row.format(i=i, n=i + 100, s=1.7e9 + 0.1 * i, **ns[i]) + "\n" for i in range(6)]
     (two_folders / "times.txt").write_text(heading + "".join(rows))
     sequence = open_sequence(two_folders)
