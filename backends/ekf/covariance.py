@@ -187,9 +187,9 @@ class Covariance:
         P[:CAMERA], by_rig[:CAMERA] = J @ P[:CAMERA], J @ by_rig[:CAMERA]
         moved = P[:CAMERA, :CAMERA] @ J.T
         own = positive(0.5 * (moved + moved.T), self.camera.diagonal(), V.shape[1])
-        gone, across = V[b:] @ V[b:].T, (P[:POSE, b:].T + 0.5 * shift @ own[:POSE, :POSE]) @ shift.T
-        gone -= across
-        gone -= across.T
+        half = P[:POSE, b:].T + 0.5 * shift @ own[:POSE, :POSE]
+        gone = V[b:] @ V[b:].T
+        gone -= np.hstack([half, shift]) @ np.hstack([shift, half]).T
         np.subtract(self.P[b:, b:], gone, out=P[b:, b:])
         summands = self.P.diagonal()[b:] + ((shift @ own[:POSE, :POSE]) * shift).sum(axis=1)
         positive(P[b:, b:], summands, V.shape[1])
