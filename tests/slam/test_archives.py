@@ -65,15 +65,6 @@ def test_encrypted_odd_and_many_members(tmp_path, members):
     refused(tmp_path, packed({f"{k}": b"" for k in range(200)}), "200 members")
 
 
-def test_a_recording_of_many_stamps_is_checked_quickly(tmp_path, members):
-    n = 100_000
-    data = changed(members, stamps=np.arange(n, dtype=float), numbers=np.arange(n))
-    (tmp_path / "a.npz").write_bytes(data)
-    started = time.process_time()
-    assert len(load_recording(tmp_path / "a.npz")) == n
-    assert time.process_time() - started < 10.0  # on a slow machine; what looks at all pairs takes minutes
-
-
 def test_a_map_that_the_filter_cannot_hold_is_refused_in_a_line():
     n = 100_000
     known = SavedMap(

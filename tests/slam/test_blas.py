@@ -4,19 +4,12 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from importlib import import_module
 
 import numpy as np
-import pytest
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 import backends
-import slam
-from slam.config import SystemConfig
-from slam.errors import SlamError
 from slam.models import EstimatorModels, MotionModel
-from slam.run import calibrating, runner
 from slam.runtime.threads import one_blas_thread
 from tests.backends.scenes import RIG, path, run, scene
 
@@ -62,34 +55,3 @@ def test_the_number_of_threads_is_one_inside_and_set_back_after_the_last():
             may_leave.set()
             assert set(running.result()) == {1}
         assert numbers() == before
-
-
-@contextmanager
-def show_nothing(sequence, count):
-    yield lambda result: None
-
-
-@pytest.mark.parametrize(
-    "name, part",
-    [
-        ("system", "slam.calibration.estimator.factory_prior"),
-        ("run", "slam.run.runner.outcome"),
-        ("calibrate", "slam.run.calibrating.joint_calibration"),
-    ],
-)
-def test_whatever_is_called_first_uses_one_thread(name, part, monkeypatch, tmp_path):
-    """Sums of many terms at the start and the end of the work as well, not only in each frame."""
-    found: list[int] = []
-    module, _, function = part.rpartition(".")
-    called = getattr(import_module(module), function)
-    monkeypatch.setattr(part, lambda *a, **k: (found.extend(numbers()), called(*a, **k))[1])
-    sequence = slam.open_sequence("synthetic:desk?frames=2&width=128&height=96")
-    with threadpool_limits(2, user_api="blas"):
-        if name == "system":
-            slam.StereoSlam(sequence.rig)
-        elif name == "run":
-            runner.run(sequence, runner.RunOptions("ekf", "surf", SystemConfig(), tmp_path))
-        else:
-            with pytest.raises(SlamError, match="no recording"):  # two frames show nothing of a rig
-                calibrating.calibrate([sequence], tmp_path / "rig.yaml", show_nothing)
-    assert set(found) == {1}
