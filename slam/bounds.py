@@ -69,7 +69,6 @@ def _range_fault(value: Any, limits: tuple[float, float] | None, positive: bool)
 
 @lru_cache(maxsize=64)
 def _hints(kind: type) -> dict[str, Any]:
-    """Types of a dataclass's fields."""
     return get_type_hints(kind)
 
 
@@ -79,7 +78,6 @@ def _is(kind: Any) -> Callable[[Any], bool]:
 
 
 def _maps_names(value: Any) -> bool:
-    """Whether a value is a mapping of names."""
     return isinstance(value, dict) and all(isinstance(key, str) for key in value)
 
 

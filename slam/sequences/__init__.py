@@ -31,8 +31,6 @@ _LISTED = 6  # sequences below a folder
 
 
 class _Format(NamedTuple):
-    """A format on disk."""
-
     matches: Callable[[Path], bool]  # whether a folder or file looks like it
     open: Callable[[Path, Options, FaultLog], RecordedSequence]
     description: str
@@ -121,7 +119,6 @@ def _open_folder(text: str, format: str | None) -> RecordedSequence:
 
 
 def _open_world(text: str) -> Sequence:
-    """A synthetic world by its text, ``synthetic:`` left out."""
     from slam.worlds import open_world
 
     name, mark, query = text.partition("?")
@@ -152,7 +149,6 @@ def _exists(text: str) -> bool:
 
 
 def _format_of(folder: Path) -> str | None:
-    """The first format that a folder or file looks like; None for no sequence."""
     return next((name for name, known in _FORMATS.items() if known.matches(folder)), None)
 
 

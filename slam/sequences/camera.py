@@ -197,7 +197,6 @@ def without_password(address: str) -> str:
 
 
 def _hint(address: str) -> str:
-    """What may be the reason."""
     import cv2
 
     if address.isdecimal():

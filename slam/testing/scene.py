@@ -156,7 +156,6 @@ def require_equal(one: Any, other: Any, what: str) -> None:
 
 
 def _few(values: Array) -> str:
-    """The first few of the values."""
     return ", ".join(f"{value:.6g}" for value in values.ravel()[:3]) + (", …" if values.size > 3 else "")
 
 
