@@ -15,7 +15,7 @@ from frontends.surf.config import SurfConfig
 from slam.bodies.config import ObjectsConfig
 from slam.calibration.config import SelfCalibrationConfig
 from slam.config import SystemConfig
-from slam.errors import ConfigurationError, SlamError, one_line
+from slam.errors import ConfigurationError
 from slam.models import EstimatorModels, MotionModel, ObjectModels
 from slam.tracks.config import AssociationConfig, MapConfig
 
@@ -104,9 +104,3 @@ def test_every_field_of_every_class_refuses_what_it_cannot_be(kind):
                 refused += 1
                 assert "\n" not in str(error) and len(str(error)) < 700 and f.name in str(error)
         assert refused >= 8, f"{kind.__name__}.{f.name} takes nearly anything"
-
-
-def test_one_line():
-    assert one_line("a\nb\x1b[1mc\0") == r"a b\x1b[1mc\x00"
-    assert len(one_line("x" * 10_000)) < 700 and "…" in one_line("x" * 10_000)
-    assert str(SlamError("a\r\nb")) == r"a\r b"
