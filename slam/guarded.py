@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from inspect import Parameter, signature
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -28,9 +29,10 @@ def guarded(backend: Any) -> Any:
     that move the camera or the map count here, too; but what these are given, it checks itself.
     """
     own = {key: getattr(backend, key) for key in ("__qualname__", "__module__", "__doc__")}
-    more = {name: method for name, method in vars(_Additional).items() if callable(method) and hasattr(backend, name)}
+    others = [name for name in dir(backend) if not name.startswith("_") and not hasattr(_Guarded, name)]
+    passed = {name: vars(_Additional).get(name, property(attrgetter(f"_backend.{name}"))) for name in others}
     backend.__qualname__ += ".__wrapped__"  # where pickle finds it
-    return type(backend.__name__, (_Guarded,), {**own, **more, "__wrapped__": backend})
+    return type(backend.__name__, (_Guarded,), {**own, **passed, "__wrapped__": backend})
 
 
 class _Guarded:
@@ -46,7 +48,7 @@ class _Guarded:
         self._backend = self.__wrapped__(rig, models or EstimatorModels(), **options)
         self._ids, self._measured, self._stamp = set[int](), True, float("nan")
 
-    def __getattr__(self, attribute: str) -> Any:  # what else the back end has
+    def __getattr__(self, attribute: str) -> Any:  # what the back end sets itself
         if attribute.startswith("_"):
             raise AttributeError(attribute)
         return getattr(self._backend, attribute)
@@ -110,7 +112,7 @@ class _Guarded:
 
 
 class _Additional(_Guarded):
-    """What the subclass has besides, where the back end has it."""
+    """What counts, too, where the back end has it; all else that it has is passed on."""
 
     def predict_at_rest(self, stamp: float) -> Prediction:
         return self._to(stamp, self._backend.predict_at_rest)

@@ -126,14 +126,8 @@ def test_a_camera_that_stays_silent_ends_the_run_with_one_line(rig_here, played)
 
 def test_what_is_asked_for_wrongly_is_one_line(rig_here, played, tmp_path):
     played({"0": [grey(0, 64)], "1": [grey(0)], "2": [grey(0, 161)], "3": []})
-    wrong = {
-        "camera:": "name one device",
-        "camera:0?colour=yes": "unknown option 'colour' of format camera",
-        "camera:0?wait=long": "wait must be a number",
-    }
-    for text, words in wrong.items():
-        with pytest.raises(ConfigurationError, match=words):
-            slam.open_sequence(text)
+    with pytest.raises(ConfigurationError, match="name one device"):
+        slam.open_sequence("camera:")
     for text, words in {
         "camera:9": "cannot be opened",
         "camera:0,1": "differ in size: camera:0,1, left is 64x120, .*right is 160x120",

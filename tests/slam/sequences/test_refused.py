@@ -16,10 +16,8 @@ from slam.sequences import open_sequence
 from slam.sequences.calibration import read_yaml
 
 RIGHT = {"euroc": "mav0/cam1", "kitti": "image_1", "raw": "image_01", "two_folders": "right"}
-CALIBRATION = {
-    "euroc": "mav0/cam1/sensor.yaml", "kitti": "calib.txt", "raw": "../calib_cam_to_cam.txt",
-    "two_folders": "calibration.yaml",
-}  # fmt: skip
+
+
 FORMATS = tuple(RIGHT)
 
 
@@ -86,23 +84,6 @@ def test_a_right_camera_that_is_none(fixture, request, build):
     assert str(folder) in refused(folder, SequenceError, "two cameras are needed")
     right.write_text("hello")
     refused(folder, SequenceError, r"a file where a folder|two cameras are needed")
-
-
-@pytest.mark.parametrize("fixture", FORMATS)
-def test_a_calibration_that_is_none(fixture, request):
-    folder: Path = request.getfixturevalue(fixture)
-    path = folder / CALIBRATION[fixture]
-    text = path.read_text()
-    for content in (b"", b"hello", b"\x00\xff\xfe" * 50, b"K1: [1, 2", b"%YAML:1.0\n---\nK1: 3\n"):
-        path.write_bytes(content)
-        assert path.name in refused(folder, CalibrationError)
-    number = next(n for n in ("50.0,", "5.000000e+01", "50.") if n in text)
-    dot, comma = "." * (path.suffix == ".yaml"), "," * number.endswith(",")
-    for word in (f"{dot}nan", f"{dot}inf", "9" * 400, "9" * 5000, "1e400", "1e300"):
-        path.write_text(text.replace(number, word + comma, 1))
-        assert path.name in refused(folder, CalibrationError, "not finite|impossibly large")
-    path.unlink()
-    assert str(folder.parent) in refused(folder, CalibrationError, "calibration is missing")
 
 
 def test_calibrations_of_other_cameras(euroc, kitti, raw, two_folders, build):
