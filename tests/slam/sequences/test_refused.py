@@ -55,7 +55,7 @@ def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, eur
         ("left=nowhere", SequenceError, "there is no such folder or video"),
         ("calibration=nowhere.yaml", CalibrationError, "the calibration is missing"),
         ("times=t.txt&fps=3", ConfigurationError, "'fps' does nothing here"),
-        ("fps=3&kind=driving&fps=30", ConfigurationError, "an option is given twice: fps=3"),
+        ("fps=3&kind=driving&fps=30", ConfigurationError, "option 'fps' is given twice"),
         ("fps=0", ConfigurationError, "fps must be a number from 0.001"),
         ("rectified=yes", CalibrationError, "P1, P2 are missing"),
         ("speed=3", ConfigurationError, "unknown option 'speed' of format folders; known: calibration, fi"),
