@@ -11,7 +11,7 @@ WITHOUT_A_FILE = [name for name in names() if name != "drive"]
 
 
 @pytest.mark.parametrize("name", WITHOUT_A_FILE)
-def test_every_world_keeps_the_protocol_of_sequences_and_moves_smoothly(name):
+def test_every_world_is_a_sequence_moves_smoothly_and_shows_landmarks_in_every_frame(name):
     sequence = open_sequence(f"synthetic:{name}")
     assert isinstance(sequence, Sequence)
     assert sequence.format == "synthetic"
@@ -24,11 +24,6 @@ def test_every_world_keeps_the_protocol_of_sequences_and_moves_smoothly(name):
     assert acceleration.max() < 6.0, "a hand or a car does not jerk harder [m/s²]"
     turn = rotation_angle(inverse(truth.poses[:-1])[:, :3, :3] @ truth.poses[1:, :3, :3]) * rate
     assert turn.max() < 2.0
-
-
-@pytest.mark.parametrize("name", WITHOUT_A_FILE)
-def test_every_world_shows_landmarks_in_every_frame(name):
-    sequence = open_world(name)
     for k in np.linspace(0, len(sequence) - 1, 12).astype(int):
         seen = sequence.simulate(k)
         assert len(seen.features) >= 15
