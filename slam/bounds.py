@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numbers
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from types import NoneType, UnionType
@@ -69,52 +69,47 @@ def _hints(kind: type) -> dict[str, Any]:
     return get_type_hints(kind)
 
 
-def _is(kind: Any) -> Callable[[Any], bool]:
-    """A test for a kind of number, of which true and false are none."""
-    return lambda value: isinstance(value, kind) and not isinstance(value, (bool, np.bool_))
-
-
-def _maps_names(value: Any) -> bool:
-    return isinstance(value, dict) and all(isinstance(key, str) for key in value)
-
-
-#: By type: what a value must fulfil, and that in words.
-_TYPES: dict[Any, tuple[Callable[[Any], bool], str]] = {
-    NoneType: (lambda value: value is None, "none"),
-    bool: (lambda value: isinstance(value, (bool, np.bool_)), "true or false"),
-    str: (lambda value: isinstance(value, str) and len(value) <= _WORD and "\0" not in value, "a text"),
-    int: (_is(numbers.Integral), "a whole number"),
-    float: (_is(numbers.Real), "a number"),
-    dict: (_maps_names, "a mapping of names to values"),
+#: By type: what a value is an instance of, and that in words.
+_TYPES: dict[Any, tuple[Any, str]] = {
+    NoneType: (NoneType, "none"),
+    bool: ((bool, np.bool_), "true or false"),
+    str: (str, "a text"),
+    int: (numbers.Integral, "a whole number"),
+    float: (numbers.Real, "a number"),
+    dict: (dict, "a mapping of names to values"),
 }
 
 
 def _type_fault(value: Any, hint: Any) -> str:
     """What is required of a value of the wrong type; empty if the type is right."""
-    origin = get_origin(hint)
-    if origin in (Union, UnionType):
-        faults = [_type_fault(value, kind) for kind in get_args(hint)]
+    kind, kinds = get_origin(hint) or hint, get_args(hint)
+    if kind in (Union, UnionType):
+        faults = [_type_fault(value, one) for one in kinds]
         return "" if "" in faults else " or ".join(filter(None, faults))
-    if origin is tuple:
-        return _tuple_fault(value, get_args(hint))
-    good, words = _TYPES.get(origin or hint, (None, ""))
-    if good is None and isinstance(hint, type) and is_dataclass(hint):
-        good, words = lambda value: isinstance(value, hint), f"of type {hint.__name__}"
-    return "" if good is None or good(value) else words
+    if kind is tuple:
+        return _tuple_fault(value, kinds)
+    of_class = (kind, f"of type {getattr(kind, '__name__', kind)}") if is_dataclass(kind) else (object, "")
+    accepted, words = _TYPES.get(kind, of_class)
+    fine = isinstance(value, accepted) and not (kind in (int, float) and isinstance(value, (bool, np.bool_)))
+    if kind is str:
+        fine = fine and len(value) <= _WORD and "\0" not in value
+    elif kind is dict:
+        fine = fine and all(isinstance(key, str) for key in value)
+    return "" if fine else words
 
 
 def _tuple_fault(value: Any, kinds: tuple[Any, ...]) -> str:
     """As `_type_fault`, for a tuple, or a list in its place."""
     if not isinstance(value, (tuple, list)):
         return "a list"
-    if len(kinds) == 2 and kinds[1] is Ellipsis:
+    if kinds[1:] == (Ellipsis,):
         if not 1 <= len(value) <= _TUPLE:
             return f"a list of 1 to {_TUPLE} values"
-        kinds = (kinds[0],) * len(value)
+        kinds = kinds[:1] * len(value)
     if len(value) != len(kinds):
         return f"a list of {len(kinds)} values"
-    faults = [_type_fault(v, kind) for v, kind in zip(value, kinds)]
-    return next((f"a list, each {fault}" for fault in faults if fault), "")
+    fault = next(filter(None, map(_type_fault, value, kinds)), "")
+    return fault and f"a list, each {fault}"
 
 
 def from_options(kind: type[_C], owner: str, options: Mapping[str, Any]) -> _C:
