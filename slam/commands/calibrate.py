@@ -27,7 +27,6 @@ _SIGN = (
     "calibration's are too large. Usual is how far good calibrations are off in that parameter alone; several together "
     "may cancel, so the pixels below say whether it is much."
 )
-_NARROW, _COLUMN = 50, 17  # characters of the table, and of each recording's column in it
 _SHOWN = {"rad": (1e3, "mrad"), "1": (1e3, "10⁻³")}  # what a parameter is multiplied by, and its unit then
 _SHARES = "f", "aspect", "down", "forward"  # shown in per cent
 
@@ -73,29 +72,23 @@ def unit_of(row: dict[str, Any], focal: float) -> tuple[float, str]:
 
 def _print(found: dict[str, Any]) -> None:
     """What the recordings say, and the table."""
-    console, apart, recordings = Console(), found["apart"], found["recordings"]
-    if not console.is_terminal:  # a file or a pipe is not 80 columns wide
-        console = Console(width=_NARROW + _COLUMN * (1 + len(recordings)))
-    fits = _NARROW + _COLUMN * len(recordings) <= console.width
-    shown = recordings if fits and len(recordings) > 1 else ()  # of a single one, all is that
-    table = Table(title="corrections: mean ± standard deviation", show_lines=False)
+    console, apart = Console(), found["apart"]
+    table = Table(title="corrections: mean ± standard deviation")
     table.add_column("parameter")
     table.add_column("unit")
-    numbers = (f"({number})" for number in range(1, len(shown) + 1))
-    for name in ("all", *numbers, *(["apart"] if apart else []), "usual"):
+    for name in ("correction", *(["apart"] if apart else []), "usual"):
         table.add_column(name, justify="right", no_wrap=True)
     for k, row in enumerate(found["parameters"]):
         factor, unit = unit_of(row, found["rig"]["focal"])
-        own = [row, *(one["pairs"] and one["parameters"][k] for one in shown)]  # none of what is left out
-        cells = [f"{factor * one['mean']:.2f} ± {factor * one['sigma']:.2f}" if one else "–" for one in own]
-        if apart:
+        cells = [f"{factor * row['mean']:.2f} ± {factor * row['sigma']:.2f}"]
+        if apart:  # by how much the recordings differ
             cells.append(f"{apart[k]:.1f} σ" if np.isfinite(apart[k]) else "–")
         table.add_row(row["name"], unit, *cells, f"± {factor * found['usual'][k]:.2g}")
     for text in filter(None, (found["judgement"], found["agreement"])):
         console.print(text, markup=False, highlight=False)
     console.print(table)
     console.print(_SIGN, highlight=False)
-    for number, one in enumerate(recordings, 1):
+    for number, one in enumerate(found["recordings"], 1):
         pairs, unsolved = one["pairs"], one["unsolved_pairs"]
         tells = f"{pairs} pairs of views" if pairs else "no pair of views that shows motion: left out"
         if unsolved:

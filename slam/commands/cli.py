@@ -127,8 +127,7 @@ def run_command(
     calibration: Annotated[_File, option("The rig's errors, from `slam calibrate` or a run.", "FILE")] = None,
     mask: _Mask = None,
     viewer: Annotated[_Text, option("Show it in Rerun, or keep it for Rerun.", "live|FILE.rrd")] = None,
-    draw: Annotated[_File, option("Draw landmarks and objects into the frames.", "DIR|FILE.mp4")] = None,
-    draw_map: Annotated[bool, option("With --draw: the growing map beside each frame.", None, "--draw-map")] = False,
+    draw: Annotated[_File, option("Draw landmarks and objects, and the map that grows.", "DIR|FILE.mp4")] = None,
     live: Annotated[bool, option("Frames at their own rate; late ones are dropped.", None, "--live")] = False,
     picture: _Picture = True,
     overwrite: _Overwrite = False,
@@ -137,7 +136,6 @@ def run_command(
     """Run one sequence through one back end."""
     from slam.commands.display import progress
     from slam.commands.run import finish, frame_count, prepare, run_folder, title
-    from slam.errors import ConfigurationError
     from slam.files import noting_inputs
     from slam.outputs import require_outputs
     from slam.run import drawing
@@ -147,8 +145,6 @@ def run_command(
     from slam.run.warm_up import compile_kernels
     from slam.sequences import is_live, with_mask
 
-    if draw_map and draw is None:
-        raise ConfigurationError("--draw-map draws beside the frames: give --draw FILE.mp4, or a folder, too")
     with noting_inputs() as inputs:
         opened, options = prepare(
             with_mask(sequence, mask), settings or (), frames, backend=backend, frontend=frontend, kind=kind,
@@ -169,7 +165,7 @@ def run_command(
         if viewer is not None:
             watches.append(stack.enter_context(viewing.Viewer(viewer, opened.rig, opened.ground_truth)).show)
         if draw is not None:
-            watches.append(stack.enter_context(drawing.FramePictures(draw, draw_map)).show)
+            watches.append(stack.enter_context(drawing.FramePictures(draw)).show)
         until = threading.Event() if live or is_live(opened) else None
         if until is not None and not quiet:
             what = "are taken until" if is_live(opened) else "come at their own rate, to the last one or until"
@@ -308,18 +304,6 @@ def render_command(
         root = write_euroc(opened, out, start, stop, tell)
     if not quiet:
         print(f"Files: {root}")
-
-
-@app.command("view", short_help="Show a finished run in Rerun.")
-def view_command(
-    folder: Annotated[Path, argument("Left by `slam run`.", "DIR")],
-    target: Annotated[str, option("A window, or a file.", "live|FILE.rrd", "--to")] = "live",
-    overwrite: _Overwrite = False,
-) -> None:
-    """Show a finished run in Rerun: path, objects and map; `slam run --viewer` shows its images, too."""
-    from slam.run.viewer import view_run
-
-    view_run(folder, target, overwrite)
 
 
 @app.command("list", short_help="List back ends, sequences and formats.")

@@ -18,7 +18,6 @@ from slam.errors import ConfigurationError, UnknownNameError
 from slam.files import read_object
 from slam.naming import unknown
 from slam.runtime.threads import available_cores
-from slam.sequences.base import said_before
 from slam.settings import require_settable
 
 _MOST_WORKERS = 1024
@@ -62,7 +61,7 @@ def compare(
         about = "" if seconds is None else f": about {seconds / min(count, len(left)):.0f} s, by the first frames"
         print(f"{len(plan.every)} runs{before}, {total} frames in all, {count} at a time{about}")
         print(limits, flush=True)
-    with said_before(), counting(total, "frames", quiet) as tell:  # `check` has said what opening says
+    with counting(total, "frames", quiet) as tell:
 
         def ended(trial: Trial) -> None:
             nonlocal done
@@ -97,7 +96,7 @@ def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
     seconds, tried = 0.0, dict[str, dict[str, float]]()
     for trial in left:
         if trial.sequence not in tried:
-            with said_before(), TemporaryDirectory(prefix="slam_trial_") as folder:
+            with TemporaryDirectory(prefix="slam_trial_") as folder:
                 stop = trial.start + min(_TRIED, frames[trial.sequence])
                 first = replace(trial, seed=0, mode=CLOSED_LOOP, stop=stop)
                 run_jobs([(first, Path(folder), None)], 1, lambda trial: None)

@@ -40,23 +40,26 @@ def progress(total: int | None, title: str, quiet: bool = False) -> Iterator[Cal
     While kernels are compiled the line says so, and how many are done.
     """
     bar = _bar(TextColumn("{task.fields[status]}"), quiet=quiet, get_time=working_time)
-    task = bar.add_task(title, total=total, status="", visible=False)
+    task, last = bar.add_task(title, total=total, status="", visible=False), ""
 
     def compiling(done: int, of: int) -> None:
         bar.start()
         bar.update(task, status=f"compiling {done}/{of}, once", visible=True)
 
     def frame(result: FrameResult) -> None:
+        nonlocal last
         bar.start()
         speed = bar.tasks[task].speed
         said = f"{result.status.value} {len(result.report.used)}/{result.map_size}"  # landmarks used, known
-        bar.update(task, advance=1, status=f"{speed:.1f} Hz {said}" if speed else said, visible=True)
+        last = f"{speed:.1f} Hz {said}" if speed else said
+        bar.update(task, advance=1, status=last, visible=True)
 
     compile_clock.watch = compiling
     try:
         yield frame
     finally:
         compile_clock.watch = None
+        bar.update(task, status=last)  # kernels may have been compiled after it
         if bar.live.is_started:
             bar.stop()
 

@@ -7,7 +7,7 @@ import io
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +43,7 @@ class RunFiles(ExitStack):
     def __init__(self, folder: Path) -> None:
         super().__init__()
         self.folder = folder
-        self._made: list[Path] = []  # folders, the innermost first
         with ExitStack() as opened, naming_folder(folder):
-            self._made += [path for path in (folder, *folder.parents) if not path.exists()]
             folder.mkdir(parents=True, exist_ok=True)
             for name in set(NAMES).difference(_ROWS):
                 remove_file(folder / name)
@@ -55,16 +53,6 @@ class RunFiles(ExitStack):
             self._frames.write(csv_rows([FRAME_COLUMNS]))
             self._objects.write(csv_rows([OBJECT_COLUMNS]))
             self.enter_context(opened.pop_all())
-
-    def discard(self) -> None:
-        """Remove all files written, and the folders made for them where nothing else is in them."""
-        for rows in (self._trajectory, self._frames, self._objects):
-            rows.close()
-        with suppress(OSError):  # what cannot be removed stays
-            for name in NAMES:
-                remove_file(self.folder / name)
-            for made in self._made:
-                made.rmdir()
 
     def write_frame(self, number: int, result: FrameResult, loop: int | str = "", refused: int | str = "") -> None:
         """Append one frame, `number` in its sequence, to trajectory.txt, frames.csv and objects.csv.

@@ -86,8 +86,6 @@ METRICS = (
            "compared main run picture"),
     Metric("ate_final_m", "final path error (ATE, aligned)", "mm", "accuracy/final/ATE RMSE [m]", "lower",
            "compared main run"),
-    Metric("ate_without_loops_m", "path error without loops (ATE, aligned)", "mm",
-           "accuracy/online without loops/ATE RMSE [m]", "lower"),
     Metric("rpe_1s_m", "drift in 1 s (RPE)", "mm", "accuracy/online/RPE RMSE over 1 s [m]", "lower", "compared run"),
     Metric("rpe_1s_deg", "drift in 1 s, rotation (RPE)", "deg", "accuracy/online/RPE rotation RMSE over 1 s [deg]",
            "lower"),

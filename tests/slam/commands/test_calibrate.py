@@ -10,7 +10,6 @@ import slam
 from slam.calibration import RigModel, RigPosterior
 from slam.calibration.corrected import corrected_rig
 from slam.errors import SlamError
-from slam.run import calibrating
 from slam.run.calibrating import _judged
 from tests.scripts import command
 
@@ -71,19 +70,6 @@ def test_a_correction_is_advised_only_where_it_is_expected_to_help(off, sigma, a
     assert f"{off:.2f} ± {sigma:.2f} px in disparity" in words and word in words
 
 
-def test_a_recording_that_is_left_out_has_no_numbers(tmp_path, monkeypatch):
-    run = calibrating._run
-
-    def standing(sequence, *given):
-        found, evidence = run(sequence, *given)
-        return found | {"pairs": 0 if "seed=1" in sequence.name else 3}, evidence
-
-    monkeypatch.setattr(calibrating, "_run", standing)
-    printed = command("calibrate", WORLD, f"{WORLD}&seed=1", "--out", tmp_path / "rig.json")
-    assert re.search(r"right_f +│ % +│ [^│]*± [^│]*│ [^│]*± [^│]*│ +– │", printed)
-    assert "left out" in " ".join(printed.split())
-
-
 def test_it_is_the_prior_of_a_run(made, tmp_path):
     folder, _ = made
     file = folder / "rig.json"
@@ -91,7 +77,6 @@ def test_it_is_the_prior_of_a_run(made, tmp_path):
     found = json.loads((tmp_path / "first" / "summary.json").read_text())["self_calibration"]["parameters"]
     expected = json.loads(file.read_text())["parameters"]
     assert [row["mean"] for row in found] == [row["mean"] for row in expected]
-    assert json.loads((tmp_path / "first" / "config.json").read_text())["calibration"] == str(file)
     command("run", WORLD, "--calibration", tmp_path / "first", "--frames", "0:1", "--out", tmp_path / "third", *QUIET)
 
 

@@ -190,5 +190,3 @@ def test_ctrl_c_ends_a_run_from_a_stuck_camera_with_all_its_files(rig_here, scen
     assert summary["ended"] == "ended by the user" and summary["frames"] >= 3
     assert summary["live"]["milliseconds behind"]["median"] > 0
     assert (out / "trajectory_final.txt").read_text().count("\n") == summary["frames"]
-    config = json.loads((out / "config.json").read_text())
-    assert (config["source_format"], config["source"]) == (None, "camera:0?wait=0")
