@@ -133,7 +133,8 @@ def scale_doubt(record: RunRecord, rig: StereoRig, driving: bool = False) -> str
     speeds, depth = _speeds(record), _depth(record)
     if len(speeds) < _LEAST_CHANGES or not np.isfinite(depth):
         return ""
-    asked = f"by the calibration the cameras are {rig.baseline:.3g} m apart; is that in metres? (unit=cm, unit=mm)"
+    apart = f"by the calibration the cameras are {rig.baseline:.3g} m apart"
+    asked = f"{apart}; is that in metres? (of a recording, unit=cm or unit=mm)"
     speed = float(np.median(speeds[:, 1]))
     if speed <= _FASTEST[driving] and depth >= _NEAREST[driving]:
         return asked if rig.baseline > _WIDEST[driving] else ""

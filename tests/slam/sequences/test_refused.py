@@ -38,7 +38,15 @@ def refused(path, error=SlamError, words=None, seconds=1.0):
 
 def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, euroc, raw):
     here = tmp_path / "here"
-    for name in ("empty", "two/left", "two/right", "two/other/a", "deep/a/b/c/left", "deep/a/b/c/right"):
+    for name in (
+        "empty",
+        "two/left",
+        "two/right",
+        "two/other/port",
+        "two/other/starboard",
+        "deep/a/b/c/left",
+        "deep/a/b/c/right",
+    ):
         (here / name).mkdir(parents=True)
     for name in ("text/a.txt", "both.mp4", "sides/0.png", *(f"cams/cam{k}.png" for k in range(6))):
         (here / name).parent.mkdir(exist_ok=True)
@@ -52,7 +60,7 @@ def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, eur
         "cams": "no sequence of a known format",  # numbered images of one camera are no pair
         "text/a.txt": r"a\.txt: a file where the sequence's folder should be; give the folder",
         "both.mp4": r"folder should be; a video .* is .*both\.mp4\?layout=sbs",
-        "two/other": "by other names",
+        "two/other": r"by other names: .other\?left=port&right=starboard",
         kitti / "image_0": rf"give {kitti} .format kitti",
         euroc / "mav0/cam0/data": rf"give {euroc}(/mav0)? .format euroc",
         kitti.parent.parent: r"no sequence of a known format .*; below it is sequences.03: give that$",
