@@ -66,7 +66,10 @@ def resolve(role: str, name: str) -> Any:
     what, own = _spoken(role), ":" in name
     target = name if own else _table(role).get(name)
     if target is None:
-        raise UnknownNameError(f"{unknown(what, name, names(role))}; or one of your own: module:Class")
+        if name == "simulated":
+            raise UnknownNameError(f"{what} {name!r} is for `slam compare` alone; known: {', '.join(names(role))}")
+        own_module = name if Path(f"{name}.py").is_file() else "module"
+        raise UnknownNameError(f"{unknown(what, name, names(role))}; or one of your own: {own_module}:Class")
     failed = f"{what} {name!r} cannot be loaded:"
     if not own and name in BUILT_IN[role] and (hidden := _hidden(role)):
         raise UnknownNameError(f"{failed} {hidden}")

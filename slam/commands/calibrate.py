@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
-from slam.commands.display import progress
+from slam.commands.display import empty_table, progress
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import ConfigurationError
@@ -73,11 +72,9 @@ def unit_of(row: dict[str, Any], focal: float) -> tuple[float, str]:
 def _print(found: dict[str, Any]) -> None:
     """What the recordings say, and the table."""
     console, apart = Console(), found["apart"]
-    table = Table(title="corrections: mean ± standard deviation")
-    table.add_column("parameter")
-    table.add_column("unit")
-    for name in ("correction", *(["apart"] if apart else []), "usual"):
-        table.add_column(name, justify="right", no_wrap=True)
+    table = empty_table(
+        "corrections: mean ± standard deviation", ["unit", "correction", *(["apart"] if apart else []), "usual"]
+    )
     for k, row in enumerate(found["parameters"]):
         factor, unit = unit_of(row, found["rig"]["focal"])
         cells = [f"{factor * row['mean']:.2f} ± {factor * row['sigma']:.2f}"]
@@ -88,9 +85,9 @@ def _print(found: dict[str, Any]) -> None:
         console.print(text, markup=False, highlight=False)
     console.print(table)
     console.print(_SIGN, highlight=False)
-    for number, one in enumerate(found["recordings"], 1):
+    for one in found["recordings"]:
         pairs, unsolved = one["pairs"], one["unsolved_pairs"]
         tells = f"{pairs} pairs of views" if pairs else "no pair of views that shows motion: left out"
         if unsolved:
             tells += f"; in {unsolved} others too few features agree on one motion of the camera"
-        console.print(f"({number}) {one['sequence']}: {one['frames']} frames, {tells}", markup=False)
+        console.print(f"{one['sequence']}: {one['frames']} frames, {tells}", markup=False)

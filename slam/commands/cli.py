@@ -246,7 +246,7 @@ def compare_command(
     overwrite: _Overwrite = False,
     quiet: Annotated[bool, option("No progress, no conclusions.", None, "--quiet", "-q")] = False,
 ) -> None:
-    """Compare back ends on the same recordings: tables, what is certain and what is not, and one HTML report."""
+    """Compare back ends on the same recordings: tables, what can be told from chance, and one HTML report."""
     from slam.commands import compare as command
     from slam.commands.run import command_line
     from slam.compare.plan import Plan

@@ -21,6 +21,7 @@ from slam.runtime.threads import available_cores
 from slam.settings import require_settable
 
 _MOST_WORKERS = 1024
+_NAMED = 3  # failed runs whose reasons are printed; the report has all
 _TRIED = 15  # frames by which the time of a comparison is told
 
 
@@ -74,7 +75,10 @@ def compare(
     report = write_report(plan, every, runs, out, limits, command)
     if not quiet:
         print_conclusions(every)
-        print(f"{len(runs)} runs, {sum(not run.completed for run in runs)} failed. Report: {report}")
+        failed = [run for run in runs if not run.completed]
+        for run in failed[:_NAMED]:
+            print(f"{run.trial.backend}, seed {run.trial.seed}: {run.outcome}")
+        print(f"Runs: {len(runs)}, {len(failed)} failed. Report: {report}")
     return runs
 
 

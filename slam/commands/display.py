@@ -80,7 +80,7 @@ def print_conclusions(every: Sequence[Group]) -> None:
         _say(f"\n{group.name}", "bold")
         for text in tables.sentences(group):
             _say(text)
-        table = _table("", group.runs)
+        table = empty_table("", group.runs)
         for metric in group.metrics:
             if not metric.main:
                 continue
@@ -93,7 +93,7 @@ def print_conclusions(every: Sequence[Group]) -> None:
             _say(text)
 
 
-def _table(title: str, names: Iterable[str]) -> Table:
+def empty_table(title: str, names: Iterable[str]) -> Table:
     """An empty table with a column for each name."""
     table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("")
@@ -108,7 +108,7 @@ def _say(text: str, style: str | None = None) -> None:
 
 def print_summary(summaries: list[dict[str, Any]], files: Sequence[Path]) -> None:
     """A table of finished runs, a column each, whether their covariances hold, and what was written."""
-    table = _table(summaries[0]["sequence"], (summary["backend"] for summary in summaries))
+    table = empty_table(summaries[0]["sequence"], (summary["backend"] for summary in summaries))
     for label, values in rows(summaries):
         table.add_row(escape(label), *values)
     _console.print(table)
@@ -141,4 +141,4 @@ def print_listing(options: bool = False) -> None:
         table.add_row(f"synthetic:{name}", escape(worlds.describe(name).splitlines()[0].partition(": ")[2]))
     table.add_row("[bold]formats[/]", ", ".join(formats()))
     _console.print(table, highlight=False)
-    _say("`slam list --options` shows the options of each built-in sequence, `slam settings NAME` those of the others.")
+    _say("`slam list --options` shows the options of built-in sequences, `slam settings NAME` of back and front ends.")

@@ -105,7 +105,7 @@ def _pairs(group: Group) -> Figure:
     for at, value, name, colour in zip(x, values, group.runs, backend_colours(list(group.runs))):
         axis.plot(at, value, "o", color=colour, ms=4, alpha=0.8, label=name)
     axis.set(xlim=(-0.5, trials - 0.5), xticks=range(0, trials, -(-trials // _MOST_TICKS)))
-    axis.set(xlabel="seed", ylabel=metric.title, ylim=(0, None))
+    axis.set(xlabel="seed", ylabel=f"online ATE [{metric.unit}]", ylim=(0, 1.08 * np.nanmax(values, initial=1e-9)))
     axis.spines[["top", "right"]].set_visible(False)
     axis.legend(frameon=False, fontsize=8, ncols=3, loc="lower left", bbox_to_anchor=(0, 1.0))  # where it hides nothing
     return figure

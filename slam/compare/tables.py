@@ -24,6 +24,7 @@ DIFFERENCE_COLUMNS = (
     "sequence", "mode", "figure", "reference", "other", "pairs", "missing", "mean_reference", "mean_other",
     "difference", "low", "high", "verdict",
 )  # fmt: skip
+_HARDLY, _FEW = 5.0, 8  # times the scatter that no estimators differ by; trials that show less with three back ends
 RUN_COLUMNS = ("sequence", "mode", "seed", "backend", "outcome")
 
 
@@ -167,7 +168,10 @@ def caution(plan: Plan, trials: int) -> str:
         return ""
     if trials == 1:
         return "One trial cannot tell a difference from chance; a recorded sequence has no more, worlds have --trials."
-    return f"{trials} trials show a difference of {reach(trials, tests):.2g} times its scatter from trial to trial."
+    if (least := reach(trials, tests)) > _HARDLY:
+        return f"{trials} trials can hardly show any difference; take --trials {_FEW} or more."
+    scatter = f"{least:.2g} times its scatter from trial to trial"
+    return f"With {trials} trials only a difference of {scatter} can be told from chance."
 
 
 def measurements(mode: str, reference: str) -> str:

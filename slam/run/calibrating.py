@@ -161,7 +161,7 @@ def _judged(
     else:
         worth, word = True, f"This is bad: calibrate anew. The noise of one feature is {noise:g} px."
     text = (
-        f"By this the calibration is off by {off[0]:.2f} ± {sigma[0]:.2f} px in disparity and {off[1]:.2f} ± "
+        f"The calibration is off by {off[0]:.2f} ± {sigma[0]:.2f} px in disparity and {off[1]:.2f} ± "
         f"{sigma[1]:.2f} px in rows (RMS over the image), so that at {_AWAY:g} baselines depths are "
         f"{100 * off[0] * _AWAY / model.focal:.1f} % wrong. {word}"
     )

@@ -63,7 +63,7 @@ def parse_frames(text: str | None) -> tuple[int, int | None]:
             raise ValueError
         start, stop = int(first or 0), int(last) if last else None
     except ValueError:
-        raise SlamError(f"frames {text!r} is not of the form A:B") from None
+        raise SlamError(f"frames {text!r} is not of the form A:B; 0:40 are the first 40") from None
     if start < 0 or max(start, stop or 0) > _MOST_FRAMES:
         raise SlamError(f"frames {text!r}: numbers of frames go from 0 to {_MOST_FRAMES}")
     return start, stop

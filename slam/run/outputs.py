@@ -61,17 +61,18 @@ class RunFiles(ExitStack):
         same of a place that it only seemed to show again.
         """
         e, r, features = result.estimate, result.report, result.features
-        sigmas = [float("nan")] * 4
+        sigmas, upper = [float("nan")] * 4, [""] * 21
         if result.located:
             R, P = e.T_world_left[:3, :3], e.covariance
             position = np.sqrt(np.maximum(np.diag(R @ P[3:, 3:] @ R.T), 0))
             sigmas = [*position, float(np.sqrt(max(np.trace(P[:3, :3]), 0.0)))]
+            upper = [f"{x:.9g}" for x in P[np.triu_indices(6)]]
         row = [
             number, f"{e.stamp:.9f}", result.status.value, result.reason,
             len(features), int(features.has_stereo.sum()), result.predicted,
             len(result.matched), len(r.used), len(r.rejected),
             len(result.added), len(result.erased), result.map_size, int(result.keyframe), loop, refused,
-            _number(features.threshold), _number(r.nis), r.dof, *map(_number, sigmas),
+            _number(features.threshold), _number(r.nis), r.dof, *map(_number, sigmas), *upper,
             *(f"{result.milliseconds.get(stage, 0.0):.3f}" for stage in STAGES),
         ]  # fmt: skip
         things = csv_rows(_object_row(number, thing) for thing in result.objects)

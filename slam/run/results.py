@@ -27,7 +27,8 @@ class Metric:
     unit: str = ""  # in which people see it
     place: str = ""  # keys of a summary one below the other; "*": the mean over bodies in view; empty: computed
     better: str = ""  # "lower", "higher", "one" (1 is honest; both ways off is worse), or "" (neither)
-    shown: str = "compared"  # where: some of "compared", "main" (in a comparison's conclusions), "run", "picture"
+    #: Where: some of "compared", "main" (in a comparison's conclusions), "run", "picture", "brief" (in that of several)
+    shown: str = "compared"
 
     @property
     def main(self) -> bool:
@@ -83,15 +84,15 @@ METRICS = (
     Metric("loops_closed", "loops closed", "", "loops/closed", shown="compared run picture"),
     Metric("loops_refused", "loops refused", "", "loops/refused"),
     Metric("ate_online_m", "online path error (ATE, aligned)", "mm", "accuracy/online/ATE RMSE [m]", "lower",
-           "compared main run picture"),
+           "compared main run picture brief"),
     Metric("ate_final_m", "final path error (ATE, aligned)", "mm", "accuracy/final/ATE RMSE [m]", "lower",
-           "compared main run"),
+           "compared main run brief"),
     Metric("rpe_1s_m", "drift in 1 s (RPE)", "mm", "accuracy/online/RPE RMSE over 1 s [m]", "lower", "compared run"),
     Metric("rpe_1s_deg", "drift in 1 s, rotation (RPE)", "deg", "accuracy/online/RPE rotation RMSE over 1 s [deg]",
            "lower"),
     Metric("segment_percent", "drift by distance (RPE)", "%", "accuracy/online/segment error [%]", "lower",
            "compared run"),
-    Metric("sigma_m", "claimed σ of the last position", "mm", "final_sigma_m", shown="run picture"),
+    Metric("sigma_m", "claimed σ of the last position", "mm", "final_sigma_m", shown="run picture brief"),
     Metric("ratio", "errors over claimed σ (1 is right)", shown="run"),
     Metric("nees_10m_per_dof", "NEES / 6 over 10 m (1 is right)", "", "consistency/NEES over 10 m", "one",
            "compared main"),
@@ -124,6 +125,7 @@ _NEES = {
     "nees_per_dof": "from the start",
     "nees_100m_per_dof": "over 100 m",
 }
+_KEYS = {over: key for key, over in _NEES.items()}
 _FEW = 0.5  # a NEES over less than this share of the stretches is no figure: they are hardly a fair choice
 
 
@@ -164,15 +166,19 @@ def rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, list[str
             yield metric.title, list(map(metric.show, values))
 
 
-def facts(summary: Mapping[str, Any]) -> str:
-    """What a run found, also where there is no truth, and whether its covariances hold, for the head of a picture."""
+def facts(summary: Mapping[str, Any], brief: bool = False) -> str:
+    """What a run found, also where there is no truth, and whether its covariances hold, for the head of a picture.
+
+    A `brief` one leaves out what runs of one sequence hardly differ in.
+    """
     if not summary:
         return ""
     found = figures(summary)
-    shown = [m for m in METRICS if "picture" in m.shown and found.get(m.key)]
+    shown = [m for m in METRICS if ("brief" if brief else "picture") in m.shown and found.get(m.key)]
     words = [f"{m.label} {m.show(found[m.key])} {m.unit}".rstrip() for m in shown]
     doubt = "do not trust this path, see the run's warnings" if summary.get("doubt") else ""
-    return "; ".join(filter(None, [doubt, *words, verdict_of_run(summary).partition(" (")[0]]))
+    covariances = verdict_of_run(summary).partition(":" if brief else " (")[0]
+    return "; ".join(filter(None, [doubt, *words, covariances]))
 
 
 def _measured(summary: Mapping[str, Any]) -> int:
@@ -237,6 +243,10 @@ def verdict_of_run(summary: Mapping[str, Any]) -> str:
             "frame"
         )
         return f"covariances cannot be judged: {why}"
+    judged = next(iter(_ratios(figures(summary))))
+    exact = honest.get(f"{BY_KEY[_KEYS[judged]].place.partition('/')[2]}, truth exact")
+    if exact is not None and np.isfinite(exact):
+        text += f"; with a truth without errors of its own {number(float(np.sqrt(exact / 6)))} times"
     if doubtful:
         over, share = next(iter(doubtful.items()))
         text += f"; not judged: {100 * share:.0f} % of the stretches {over}, where the true path is doubtful"

@@ -256,7 +256,8 @@ class _Run:
         doubt = no_path or motion_doubt(record, options.config.models.motion, driving)
         in_map, dropped = options.prior_map is not None, self.live.dropped if self.live else 0
         own = options.backend if ":" in options.backend else ""
-        tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving, own)
+        recorded = isinstance(self.sequence, Recording)
+        tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving, own, recorded)
         if doubt and not tracking:
             logger.warning("%s", doubt)
         return {

@@ -44,7 +44,7 @@ class Viewer:
         try:
             self.rr = import_module("rerun")
         except ImportError as error:
-            raise SlamError("the viewer needs Rerun: pip install rerun-sdk") from error
+            raise SlamError("the viewer needs Rerun: pip install '.[viewer]' in the checkout, or rerun-sdk") from error
         self._target, self._rig, self._truth = target, rig, truth
         self._recording = _open(self.rr, target)
         self._stamps: list[float] = []

@@ -202,6 +202,6 @@ def _hint_near(folder: Path) -> str:
             return f"; it is a part of one: give {parent} (format {name})"
     if images:
         return f"; where each image holds both cameras: '{folder.name}?layout=sbs'; else name both: ?left=…&right=…"
-    inside = sorted(path.name for path in islice(folder.iterdir(), _LOOKED_AT) if path.is_dir())
-    left, right = inside if len(inside) == 2 else ("…", "…")
+    names = sorted(path.name for path in islice(folder.iterdir(), _LOOKED_AT) if path.is_dir())
+    left, right = names if len(names) == 2 else ("…", "…")
     return f"; where two cameras are in it by other names: '{folder.name}?left={left}&right={right}'"

@@ -166,6 +166,8 @@ def _rig(entries: Entries, images: Size | None, unit: float, rectified: bool, fi
             return _rectified(P, size)
     missing = [f"K{side + 1}" for side in (0, 1) if not with_K[side]]
     missing += [role for role in ("R", "T") if T_right_left is None and entries.find(role) is None]
+    lenses = [any(entries.find(role, side) for role in ("D", *_COEFFICIENTS)) for side in (0, 1)]
+    missing += [f"D{side + 1}" for side in (0, 1) if lenses[1 - side] and not lenses[side]]
     if missing or T_right_left is None:
         raise entries.incomplete(missing)
     left, right = (_camera(entries, side, sizes[side] or size, fisheye) for side in (0, 1))

@@ -36,7 +36,7 @@ def test_two_recordings_of_one_rig(made):
     assert tree["agreement"].startswith("The recordings agree")
     assert all(word in printed for word in ("apart", "roll", "no uncertainty", "added to measured pixels"))
     assert tree["judgement"] in " ".join(printed.split())
-    assert tree["judgement"].startswith("By this the calibration is off by")
+    assert tree["judgement"].startswith("The calibration is off by")
     model = RigModel(slam.open_sequence(WORLD).rig)
     factors = {"left_cx": (model.focal, "px"), "right_f": (100, "%"), "left_k1": (1000, "10⁻³"), "yaw": (1000, "mrad")}
     for row in [row for row in tree["parameters"] if row["name"] in factors]:

@@ -53,6 +53,7 @@ AGAIN = "features are found in both images, but not again in the next frame"
     ("features", "baseline", "more", "words"),
     [
         ((8, 8), 0.12, {}, "the images show hardly anything to follow (8 features in the median of these frames)"),
+        ((8, 8), 0.12, {"recorded": True}, "the run that was recorded was not tracked there: it has 8 measurements"),
         ((200, 3), 0.12, {}, "in the median of these frames 3 of 200 features are found in the right image"),
         ((200, 150), 120.0, {}, "the cameras are 120 m apart"),
         ((200, 150), 0.12, {"dropped": 40}, "40 frames were dropped, and the frames about them are far apart"),
