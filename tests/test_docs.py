@@ -22,9 +22,8 @@ from slam.evaluation.metrics import absolute_errors
 from slam.geometry import se3
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
-from slam.sequences.rigs import write_opencv
 from slam.settings import can_be_set
-from tests.recordings import write_storage, write_video
+from tests.recordings import write_opencv, write_storage, write_video
 from tests.scripts import load_script
 
 ROOT = Path(__file__).parent.parent

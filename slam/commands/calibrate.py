@@ -37,7 +37,6 @@ def calibrate(
     frames: tuple[int, int | None],
     format: str | None,
     quiet: bool,
-    opencv: Path | None,
     overwrite: bool,
 ) -> None:
     """Run recordings of one rig; write and print what they say of it, see `slam.run.calibrating`."""
@@ -51,15 +50,12 @@ def calibrate(
     require_settable(settings, SystemConfig().to_json(), "surf")
     with noting_inputs() as inputs:
         opened = [open_sequence(text, format=format) for text in texts]
-    found = run(opened, out, show, settings, frames, inputs, opencv, overwrite)
+    found = run(opened, out, show, settings, frames, inputs, overwrite)
     for warning in found["warnings"]:
         logging.getLogger(__name__).warning("%s", warning)
     if quiet:
         return
     _print(found)
-    if opencv:
-        off = found["opencv_off_px"]
-        print(f"The corrected calibration holds the corrections to {off:.3f} px, and no uncertainty.")
     print(f"Use it: slam run SEQUENCE --calibration {out}" if found["worth_correcting"] else f"File: {out}")
 
 
@@ -70,7 +66,6 @@ def unit_of(row: dict[str, Any], focal: float) -> tuple[float, str]:
 
 
 def _print(found: dict[str, Any]) -> None:
-    """What the recordings say, and the table."""
     console, apart = Console(), found["apart"]
     table = empty_table(
         "corrections: mean ± standard deviation", ["unit", "correction", *(["apart"] if apart else []), "usual"]

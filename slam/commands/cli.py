@@ -79,7 +79,6 @@ def main() -> None:
 
 
 def _print_version(wanted: bool) -> None:
-    """What ``--version`` prints."""
     if wanted:
         from slam.version import __version__
 
@@ -263,7 +262,6 @@ def compare_command(
 def calibrate_command(
     sequences: Annotated[list[str], argument("Recordings of one rig.", "SEQUENCE")],
     out: Annotated[Path, option("For `slam run --calibration`.", "FILE", "--out", "-o")] = Path("rig_errors.json"),
-    opencv: Annotated[_File, option("The corrected calibration in OpenCV's form.", "FILE.yaml")] = None,
     settings: _Set = None,
     frames: _Frames = None,
     format: _Format = None,
@@ -277,7 +275,7 @@ def calibrate_command(
     from slam.sequences import with_mask
 
     texts = [with_mask(text, mask) for text in sequences]
-    calibrate(texts, out, settings or [], parse_frames(frames), format, quiet, opencv, overwrite)
+    calibrate(texts, out, settings or [], parse_frames(frames), format, quiet, overwrite)
 
 
 @app.command("render", short_help="Write a built-in sequence as a folder.")

@@ -63,7 +63,6 @@ def write_report(
 
 
 def _times(group: Group, backend: str, stages: dict[str, str]) -> tuple[str, ...]:
-    """A row of medians."""
     own = group.runs[backend]
     values = ([run.milliseconds[stage] for run in own if stage in run.milliseconds] for stage in stages)
     return (group.name, backend, *(f"{np.median(each):.2f}" if each else "–" for each in values))

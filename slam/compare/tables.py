@@ -17,7 +17,7 @@ from slam.compare.statistics import Difference, difference, reach
 from slam.compare.sweep import Run
 from slam.files import write_text
 from slam.geometry.se3 import Array
-from slam.run.outputs import csv_rows
+from slam.run.outputs import csv_number, csv_rows
 from slam.run.results import COMPARED, DOUBTED, Metric, number, verdict
 
 DIFFERENCE_COLUMNS = (
@@ -89,7 +89,7 @@ def write_tables(every: Sequence[Group], runs: Sequence[Run], out: Path) -> None
     """Write runs.csv and differences.csv; times, in which no two runs agree, are in each run's ``summary.json``."""
     lines: list[tuple[object, ...]] = [(*RUN_COLUMNS, *(metric.key for metric in COMPARED))]
     for run in runs:
-        t, values = run.trial, (_number(run.metrics.get(metric.key, np.nan)) for metric in COMPARED)
+        t, values = run.trial, (csv_number(run.metrics.get(metric.key, np.nan)) for metric in COMPARED)
         lines.append((t.sequence, t.mode, t.seed, t.backend, run.outcome, *values))
     write_text(out / "runs.csv", csv_rows(lines))
     lines = [DIFFERENCE_COLUMNS]
@@ -97,13 +97,8 @@ def write_tables(every: Sequence[Group], runs: Sequence[Run], out: Path) -> None
         for key, compared in group.compared.items():
             for other, d in compared.items():
                 head = group.sequence, group.mode, key, next(iter(group.runs)), other, d.pairs, d.missing
-                lines.append((*head, *map(_number, (d.reference, d.other, d.mean, d.low, d.high)), d.verdict))
+                lines.append((*head, *map(csv_number, (d.reference, d.other, d.mean, d.low, d.high)), d.verdict))
     write_text(out / "differences.csv", csv_rows(lines))
-
-
-def _number(value: float) -> str:
-    """A number for a CSV cell; empty where there is none."""
-    return f"{value:.9g}" if np.isfinite(value) else ""
 
 
 def row(group: Group, metric: Metric) -> list[dict[str, str]]:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from slam.calibration import RigModel, RigPosterior
-from slam.calibration.corrected import corrected_rig
 from slam.calibration.posterior import SIGMAS, RigEvidence, factory_prior
 from slam.calibration.saved import CERTAIN, agreement, agreement_in_words, joint_calibration
 from slam.config import SystemConfig
@@ -23,7 +22,6 @@ from slam.run.outputs import write_json
 from slam.runtime.threads import one_blas_thread
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import is_live
-from slam.sequences.rigs import write_opencv
 from slam.system import StereoSlam
 
 _BACKEND, _FRONTEND = "ekf", "surf"  # poses are a first guess alone
@@ -46,7 +44,6 @@ def calibrate(
     settings: Sequence[str] = (),
     frames: tuple[int, int | None] = (0, None),
     inputs: Sequence[Path] = (),
-    opencv: Path | None = None,
     overwrite: bool = False,
 ) -> dict[str, Any]:
     """Run a range of frames of recordings of one rig; returns what they say of it, which is also written to `out`.
@@ -54,9 +51,8 @@ def calibrate(
     Besides the keys of `slam.calibration.SavedCalibration` it has ``recordings``, what each says alone; ``apart``, by
     how many standard deviations two differ at most in each parameter (null for a single recording); ``usual``, how far
     good calibrations are off in each; ``agreement`` and ``judgement``, how good the calibration was, in words;
-    ``worth_correcting``, whether correcting is expected to help; and ``warnings``. `opencv` is a file for the corrected
-    calibration in that form, which is off by ``opencv_off_px`` (RMS). `inputs` are never replaced. Raises SlamError on
-    bad input, before anything is run.
+    ``worth_correcting``, whether correcting is expected to help; and ``warnings``. `inputs` are never replaced. Raises
+    SlamError on bad input, before anything is run.
     """
     rig = sequences[0].rig
     for sequence in sequences:
@@ -64,8 +60,7 @@ def calibrate(
             raise ConfigurationError(f"{sequence.name}: a recording is needed, not a camera")
         if difference := rig_difference(rig_numbers(rig), rig_numbers(sequence.rig)):
             raise CalibrationError(f"{sequence.name}: not the rig of {sequences[0].name}: {difference}")
-    files = ((out, "--out"), (opencv, "--opencv"))
-    require_outputs([Output(file, option) for file, option in files if file is not None], inputs, overwrite)
+    require_outputs([Output(out, "--out")], inputs, overwrite)
     configs = [
         SystemConfig.for_kind(sequence.kind, _FRONTEND).with_settings(["objects.mode=off", *settings])
         for sequence in sequences
@@ -76,7 +71,6 @@ def calibrate(
     model, known = RigModel(rig), [one for one in evidence if one is not None]
     kept = joint_calibration(model, factory_prior(model), known)
     apart = agreement(model, known)
-    corrected = corrected_rig(model, kept.posterior.mean)
     pairs, unsolved = (sum(one[key] for one in recordings) for key in ("pairs", "unsolved_pairs"))
     warning, judgement, worth = "" if pairs else _NO_PAIRS, "", False
     doubt = next((f"{one['sequence']}: {one['doubt']}" for one in recordings if one["doubt"]), "")
@@ -97,12 +91,9 @@ def calibrate(
         "agreement": None if apart is None else agreement_in_words(apart),
         "judgement": judgement,
         "worth_correcting": worth,
-        "opencv_off_px": float(np.hypot(corrected.left_off, corrected.right_off)),
         "warnings": [warning] if warning else [],
     }
     write_json(out, found)
-    if opencv is not None:
-        write_opencv(opencv, corrected.rig)
     return found
 
 

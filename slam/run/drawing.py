@@ -40,7 +40,6 @@ _REACH = 2.5  # widths of the map in distances of the first landmarks
 
 
 def _bgr(body: int) -> tuple[int, int, int]:
-    """The colour of a moving body, by its id."""
     red, green, blue = body_colour(body)
     return blue, green, red
 
@@ -246,7 +245,6 @@ class FramePictures(ExitStack):
             self._video.write(picture)
 
     def _open(self, rate: float) -> None:
-        """Begin the video with the first picture."""
         import cv2
 
         assert self._first is not None

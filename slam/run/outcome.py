@@ -210,5 +210,4 @@ def _depth(record: RunRecord) -> float:
 
 
 def _rounded(value: float) -> str:
-    """Two digits, without an exponent."""
     return f"{float(f'{value:.2g}'):g}"

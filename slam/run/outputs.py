@@ -72,7 +72,7 @@ class RunFiles(ExitStack):
             len(features), int(features.has_stereo.sum()), result.predicted,
             len(result.matched), len(r.used), len(r.rejected),
             len(result.added), len(result.erased), result.map_size, int(result.keyframe), loop, refused,
-            _number(features.threshold), _number(r.nis), r.dof, *map(_number, sigmas), *upper,
+            csv_number(features.threshold), csv_number(r.nis), r.dof, *map(csv_number, sigmas), *upper,
             *(f"{result.milliseconds.get(stage, 0.0):.3f}" for stage in STAGES),
         ]  # fmt: skip
         things = csv_rows(_object_row(number, thing) for thing in result.objects)
@@ -151,9 +151,9 @@ def _object_row(number: int, thing: MovingObject) -> list[Any]:
     return [number, f"{e.stamp:.9f}", thing.id, *flags, *(f"{x:.9g}" for x in numbers)]
 
 
-def _number(value: float) -> str:
+def csv_number(value: float) -> str:
     """A number for a CSV cell; empty where it is not finite."""
-    return f"{value:.6g}" if np.isfinite(value) else ""
+    return f"{value:.9g}" if np.isfinite(value) else ""
 
 
 def _finite(tree: Any) -> Any:

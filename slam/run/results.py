@@ -187,7 +187,6 @@ def _measured(summary: Mapping[str, Any]) -> int:
 
 
 def _at(tree: Any, place: str, default: Any = None) -> Any:
-    """What is at a place of a summary."""
     for key in place.split("/"):
         tree = tree.get(key) if isinstance(tree, Mapping) else None
     return default if tree is None else tree

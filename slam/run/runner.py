@@ -271,5 +271,4 @@ class _Run:
 
 
 def _said(error: BaseException) -> str:
-    """An error in one line."""
     return one_line(text_of(error)) or type(error).__name__

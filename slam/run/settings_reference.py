@@ -100,7 +100,6 @@ def listing(wanted: str | None, width: int) -> Iterator[str]:
 
 
 def _typed(value: Any) -> str:
-    """A value as it can be typed."""
     return (value or '""') if isinstance(value, str) else json.dumps(value)
 
 
