@@ -301,8 +301,11 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
             if run.truth is not None:
                 axis.plot(time, times * error[:, k], color=colour, lw=0.7 * width)
             axis.plot(time, times * sigma[:, k], "--", color=colour, lw=0.7 * width)
-            for start in (run.online.stamps - run.online.stamps[:1])[~run.measured]:
+            every = run.online.stamps - run.online.stamps[:1]
+            for start in every[~run.measured]:
                 axis.axvspan(start, start, color=colour, alpha=0.2)
+            for start in every[~np.isin(every, time)]:
+                axis.axvspan(start, start + 1.1 * np.median(np.diff(every)), color="0.92", lw=0, zorder=0)
         values = np.concatenate([line.get_ydata() for line in axis.lines])
         values = values[values > 0]
         if len(values):
@@ -322,7 +325,8 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
         axis.set_xlim(-0.01 * end, 1.01 * end or 1.0)
     axes[0].tick_params(labelbottom=False)
     noisy = any(run.truth is not None and not run.truth_is_exact for run in runs)
-    title = f"Online error since the start (solid), claimed σ{' and that of the truth' if noisy else ''} (dashed)"
+    title = "Online error since the start (solid), claimed σ (dashed)"
+    title += "\nσ with that of the truth; grey: the truth is doubtful" if noisy else ""
     axes[0].set_title(title if known else "Claimed σ of the online pose; no true path is known")
     axes[-1].set_xlabel("time [s]")
     if len(runs) > 1:
