@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import slam
-from backends.ekf import EkfBackend
 from experiments.parameters import find
 from experiments.sensitivity import name_of
 from frontends.surf import SurfConfig
@@ -185,8 +184,6 @@ _FRAMES = 11
 
 def reader_has(name):
     """What the Python of a page takes for granted."""
-    if name == "docs/adding_a_backend.md":
-        return {"MyBackend": EkfBackend}
     if name == "docs/selfcalibration.md":
         rig = slam.open_sequence("synthetic:street?frames=2").rig
         slam.save_calibration("rig.json", slam.StereoSlam(rig).calibration.kept())
