@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import pytest
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.run.options import RunOptions
-from slam.run.plots import KINDS, drawn
+from slam.run.plots import KINDS
 from slam.run.plots import plot_folders as plot_runs
 from slam.run.run_data import RunData, pose_errors
 from slam.run.runner import run
@@ -62,13 +61,3 @@ def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(runs):
     summary = run_.summary["accuracy"]["online"]
     assert np.sqrt(np.mean(error[:, 1] ** 2)) == pytest.approx(summary["rotation RMSE from start [deg]"], rel=1e-3)
     assert (error[1:, 1] < 5 * sigma[1:, 1]).all() and (sigma[1:, 1] > 0).all()
-
-
-def test_a_doubted_path_is_red_and_curves_stay_within_their_axes(runs):
-    run_ = RunData.read(runs / "a", "a")
-    figure = drawn([replace(run_, summary={**run_.summary, "doubt": "rows do not agree"})], "summary")
-    assert "do not trust this path" in figure.get_suptitle() and figure._suptitle.get_color() == "#c62828"
-    logs = [axis for axis in figure.axes if axis.get_yscale() == "log"]
-    lowest = [(axis.get_ylim()[0], min(line.get_ydata().min() for line in axis.lines)) for axis in logs]
-    assert lowest and all(bottom <= low for bottom, low in lowest)
-    assert drawn([run_], "summary")._suptitle.get_color() == "k"
