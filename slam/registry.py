@@ -86,6 +86,8 @@ def resolve(role: str, name: str) -> Any:
             where = f": {_hidden(package) or f'`{package}` is the package of slam, so call yours by another name'}"
         elif own and package == module.partition(".")[0]:
             where = f"; looked for in {Path.cwd()}, where `slam` runs, among the installed packages, and in PYTHONPATH"
+        elif own:  # what the module itself imports
+            raise UnknownNameError(f"{failed} {cause(error)}") from error
         raise UnknownNameError(f"{failed} {text_of(error)}{where}") from error
     except (ImportError, AttributeError, ValueError, TypeError, SyntaxError) as error:
         raise UnknownNameError(f"{failed} {text_of(error)}") from error

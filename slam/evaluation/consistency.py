@@ -32,6 +32,9 @@ STRETCHES = (1.0, 10.0, 100.0)
 #: Beside the figures: the cameras are those of the calibration, while the covariances count errors of one.
 EXACT = "exact calibration"
 
+#: The same, where the back end's covariances count no errors of the calibration, as others' do.
+PIXELS_ALONE = "pixel noise alone"
+
 _DOF = 6
 _SMALLEST = 1e-12  # eigenvalue of a covariance [rad², m²] below which it is none
 _ROUNDING = 1e-14  # eigenvalues below this share of the largest are rounding

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.evaluation.consistency import EXACT
+from slam.evaluation.consistency import EXACT, PIXELS_ALONE
 from slam.evaluation.metrics import chi_square_band
 
 _SCALES = {"mm": 1e3, "%": 100.0}  # units in which people see metres and shares
@@ -102,6 +102,7 @@ METRICS = (
     Metric("nees_100m_per_dof", "NEES / 6 over 100 m (1 is right)", "", "consistency/NEES over 100 m", "one"),
     Metric("exact_calibration", "cameras without errors, of which covariances count some", "",
            f"consistency/{EXACT}", shown=""),
+    Metric("pixels_alone", "covariances of pixel noise alone", "", f"consistency/{PIXELS_ALONE}", shown=""),
     Metric("nis_per_dof", "NIS / dof (up to 1 is right)", "", "consistency/NIS per degree of freedom"),
     Metric("map_size", "landmarks in the map, mean"),
     Metric("landmark_error_m", "median landmark error", "mm", "", "lower", "compared main"),
@@ -220,6 +221,8 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     band = f"({low:.2f} to {high:.2f} in 95 % of {of})"
     if exact:
         others.append("they count errors of the calibration, and this world's cameras have none")
+    if found.get("pixels_alone"):
+        others.append("they count pixel noise alone, and no errors of the calibration")
     return "; ".join([f"covariances {word}: {times} {band}", *others])
 
 

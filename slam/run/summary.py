@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from slam.data import CommonError, Estimate, FrameResult
-from slam.evaluation.consistency import EXACT
+from slam.evaluation.consistency import EXACT, PIXELS_ALONE
 from slam.evaluation.objects import ObjectScore
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.input.features import Rectification
 from slam.input.warnings import REPEATED
-from slam.interfaces import Backend
+from slam.interfaces import Backend, ConsideringBackend
 from slam.run.recording import Recording
 from slam.run.schema import STAGES
 from slam.runtime.compilation import compile_clock
@@ -148,6 +148,8 @@ def results_of(
         values = getattr(sequence, "values", None)  # of a world: with recordings nobody knows
         if "mean NEES" in found["consistency"] and system.config.self_calibration.enabled and values is not None:
             found["consistency"][EXACT] = not (values["focal_error"] or values["turn_error"])
+        if found["consistency"].get("dof") and system.config.self_calibration.enabled:
+            found["consistency"][PIXELS_ALONE] = not isinstance(system.backend, ConsideringBackend)
         found["self_calibration"] = system.calibration.summary()
         found["loops"] = system.atlas.summary()
         found["bodies"] = len(record.bodies)
