@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,11 @@ import numpy as np
 from rich.console import Console
 
 from slam.commands.display import empty_table, progress
+from slam.commands.run import frame_count
 from slam.config import SystemConfig
-from slam.data import FrameResult
 from slam.errors import ConfigurationError
 from slam.files import noting_inputs
 from slam.run.calibrating import calibrate as run
-from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
 from slam.settings import require_settable
 
@@ -40,17 +38,15 @@ def calibrate(
     overwrite: bool,
 ) -> None:
     """Run recordings of one rig; write and print what they say of it, see `slam.run.calibrating`."""
-
-    def show(sequence: StereoSequence, count: int) -> AbstractContextManager[Callable[[FrameResult], None]]:
-        return progress(count, f"…{sequence.name[-14:]}", quiet)
-
     twice = next((text for k, text in enumerate(texts) if text in texts[:k]), None)
     if twice is not None:
         raise ConfigurationError(f"{twice}: given twice; it would count as two recordings that agree")
     require_settable(settings, SystemConfig().to_json(), "surf")
     with noting_inputs() as inputs:
         opened = [open_sequence(text, format=format) for text in texts]
-    found = run(opened, out, show, settings, frames, inputs, overwrite)
+    count = sum(frame_count(sequence, *frames) or 0 for sequence in opened)
+    with progress(count, "calibrate", quiet) as tell:
+        found = run(opened, out, settings, frames, inputs, overwrite, tell)
     for warning in found["warnings"]:
         logging.getLogger(__name__).warning("%s", warning)
     if quiet:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -32,19 +31,18 @@ _NO_PAIRS = (
 )
 _AWAY = 50.0  # baselines at which the error of the depth is said
 
-#: Shows the progress of a recording of so many frames: gives what is called after each.
-Show = Callable[[StereoSequence, int], AbstractContextManager[Callable[[FrameResult], None]]]
+OnFrame = Callable[[FrameResult], None]
 
 
 @one_blas_thread
 def calibrate(
     sequences: Sequence[StereoSequence],
     out: Path,
-    show: Show,
     settings: Sequence[str] = (),
     frames: tuple[int, int | None] = (0, None),
     inputs: Sequence[Path] = (),
     overwrite: bool = False,
+    on_frame: OnFrame = lambda result: None,
 ) -> dict[str, Any]:
     """Run a range of frames of recordings of one rig; returns what they say of it, which is also written to `out`.
 
@@ -67,7 +65,7 @@ def calibrate(
     ]
     if not all(config.self_calibration.enabled for config in configs):
         raise ConfigurationError("slam calibrate needs self_calibration.enabled=true")
-    recordings, evidence = zip(*(_run(*each, frames, show) for each in zip(sequences, configs)))
+    recordings, evidence = zip(*(_run(*each, frames, on_frame) for each in zip(sequences, configs)))
     model, known = RigModel(rig), [one for one in evidence if one is not None]
     kept = joint_calibration(model, factory_prior(model), known)
     apart = agreement(model, known)
@@ -98,15 +96,17 @@ def calibrate(
 
 
 def _run(
-    sequence: StereoSequence, config: SystemConfig, frames: tuple[int, int | None], show: Show
+    sequence: StereoSequence,
+    config: SystemConfig,
+    frames: tuple[int, int | None],
+    on_frame: Callable[[FrameResult], None],
 ) -> tuple[dict[str, Any], RigEvidence | None]:
     """What one recording says alone, and its evidence without any prior; None where no motion was seen."""
     system = StereoSlam(sequence.rig, _FRONTEND, _BACKEND, config=config)
     matched = []
-    with show(sequence, len(range(len(sequence))[slice(*frames)])) as on_frame:
-        for _, result in system.run(sequence.frames(*frames)):
-            on_frame(result)
-            matched.append(len(result.matched))
+    for _, result in system.run(sequence.frames(*frames)):
+        on_frame(result)
+        matched.append(len(result.matched))
     own = system.calibration
     found = {
         "sequence": sequence.name,

@@ -35,7 +35,7 @@ def test_trials_are_paired_and_have_folders_of_their_own():
         ((WORLDS, ("ekf", "ekf")), "twice"),
         ((("synthetic:box?seed=3",), ("ekf",)), "seed"),
         ((("/data",), ("ekf",), "simulated"), "worlds alone"),
-        ((WORLDS, ("ekf",), "surf", (), 0), "trials must be from 1 to 100000"),
+        ((WORLDS, ("ekf",), "surf", (), 0), "trials must be 1 or more"),
     ],
 )
 def test_bad_plans(arguments, word):
