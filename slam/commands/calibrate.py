@@ -22,7 +22,7 @@ from slam.settings import require_settable
 _SIGN = (
     "Corrections are added to measured pixels, seen from the principal point: cx and f are positive where the "
     "calibration's are too large. Usual is how far good calibrations are off in that parameter alone; several together "
-    "may cancel, so the pixels below say whether it is much."
+    "may cancel, so the pixels above say whether it is much."
 )
 _SHOWN = {"rad": (1e3, "mrad"), "1": (1e3, "10⁻³")}  # what a parameter is multiplied by, and its unit then
 _SHARES = "f", "aspect", "down", "forward"  # shown in per cent

@@ -116,7 +116,7 @@ def stretch_nees(
     values = np.full(len(first), np.nan)
     if usable.any():
         N, A, G = N[usable], A[usable], G[usable]
-        J = _by_mounting(true, noise, first[usable], last[usable], A)
+        J = by_mounting(true, noise, first[usable], last[usable], A)
         errors = _remounted(np.concatenate([residuals[usable, :, None], G], axis=2), J, _with(N, G))
         values[usable] = nees(errors[:, :, 0], _with(N, errors[:, :, 1:]))
     return values
@@ -135,7 +135,7 @@ def _with(N: Array, G: Array) -> Array:
     return np.asarray(N + G @ np.swapaxes(G, 1, 2))
 
 
-def _by_mounting(true: Trajectory, noise: TruthNoise, first: RowArray, last: RowArray, A: Array) -> Array:
+def by_mounting(true: Trajectory, noise: TruthNoise, first: RowArray, last: RowArray, A: Array) -> Array:
     """Derivatives (M, 6, 7) of relative poses by how the truth's sensor is mounted and by its clock, of unit variance.
 
     With ``T_true = T exp(w)`` for all poses, w = [mounting, lever], a relative pose is off by ``(1 − A) w``; with a

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from slam.errors import SlamError
+from slam.evaluation.consistency import by_mounting
 from slam.evaluation.metrics import align, associate
 from slam.evaluation.summary import rotation_errors
 from slam.evaluation.truth_error import interpolated, truth_covariances
@@ -173,7 +174,8 @@ def pose_errors(run: RunData) -> tuple[Array, Array, Array]:
     turned = np.linalg.norm(rotation_errors(own, true, 0.0 if run.truth_is_exact else _TURNED), axis=1)
     first, last = np.zeros(len(own), np.intp), np.arange(len(own))
     A = adjoint(inverse(inverse(own.poses[first]) @ own.poses))
-    P = truth_covariances(true, run.truth_noise, first, last, A)
+    P, J = truth_covariances(true, run.truth_noise, first, last, A), by_mounting(true, run.truth_noise, first, last, A)
+    P[:, 3:, 3:] += J[:, 3:] @ np.swapaxes(J[:, 3:], 1, 2)  # a constant turn is taken from the rotation's error instead
     of_truth = np.column_stack([np.trace(P[:, i : i + 3, i : i + 3], axis1=1, axis2=2) for i in (3, 0)])
     claimed = run.deviations[np.searchsorted(run.online.stamps, own.stamps)]
     sigma = np.sqrt(claimed**2 + np.maximum(of_truth, 0.0) * [1, np.degrees(1) ** 2])
