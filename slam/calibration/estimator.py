@@ -178,8 +178,10 @@ class SelfCalibration:
         rows, fields = row_evidence(self.model, view.points[some], view.vertical[some], self._own.mean)
         self._rows.add(rows)
         self._fields = fields if self._fields is None else self._fields + fields
+        pairs, part = self.pairs, self._open
         self._compare(view)
-        if self.pairs or self._open is not None:
+        # By rows alone the posterior would change little: it follows what motion shows.
+        if self.pairs > pairs or (self._open is not part and (self.pairs or self._open is not None)):
             self._update()
 
     def _has_turned(self, T_world_left: Array) -> bool:
