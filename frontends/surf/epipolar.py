@@ -71,7 +71,6 @@ def _column_sums(pixels, y, sums):
 
 @vector_helper
 def _row_weights(sums, weight, y):
-    """Weights of a row from the column sums of its patches."""
     area, zero = np.float32(_SIDE * _SIDE), np.float32(0.0)
     least = np.float32(_FLAT * _FLAT) * area
     for x in range(sums.shape[1] - 2 * _HALF):

@@ -99,7 +99,6 @@ def following(features: StereoFeatures, dimensions: int | None, after: float) ->
 
 
 def _number(name: str, value: Any) -> float:
-    """A real number as a float."""
     if isinstance(value, Real) and not isinstance(value, bool):
         try:
             return float(value)
