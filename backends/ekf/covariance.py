@@ -151,7 +151,8 @@ class Covariance:
         rows = np.concatenate([parked, state])
         joining = np.flatnonzero(rows >= self.correlated)
         numbers = np.append(np.arange(HEAD), self.numbers(rows)).clip(max=len(self.P) - 1)
-        P, by_rig, at = self.P[np.ix_(numbers, numbers)], self.by_rig[numbers], self.numbers(joining)
+        P = np.ascontiguousarray(self.P[numbers].T)[numbers]  # rows alone are copied fast
+        by_rig, at = self.by_rig[numbers], self.numbers(joining)
         P[at], P[:, at], by_rig[at] = 0.0, 0.0, 0.0
         P[at[:, :, None], at[:, None, :]] = self.known[rows[joining] - self.correlated]
         return replace(self, P=P, by_rig=by_rig, known=self.known[known - self.correlated], parked=len(parked))

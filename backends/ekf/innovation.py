@@ -86,6 +86,12 @@ class Update:
         Z = dpotrs(root, N, lower=1)[0] if info == 0 else np.full(N.shape, np.nan)
         return np.linalg.solve(N.T @ Z, Z.T) if np.isfinite(Z).all() else None
 
+    def predicted(self, camera: Camera, change: Array) -> Array:
+        """What a camera would measure (M, 3) [px] of landmarks after a change of the state (n,); NaN behind it."""
+        marks, asked = self.landmarks, change[self.measured[POSE:]].reshape(-1, 3)
+        points = self.coordinates.points(marks.anchors, self.coordinates.moved(marks.c, asked))
+        return self.measure.stereo.project((points - camera.pose[:3, 3]) @ camera.pose[:3, :3])[0]
+
     def at(self, camera: Camera | None = None, moved: Array | None = None) -> Linearisation:
         """Linearised at a camera and a change (3A,) of the state's landmarks, by default those of the prior.
 

@@ -15,6 +15,6 @@ def lessen(P, begin, upper):
         for start in range(first, n, _BLOCK):
             for i in range(first, min(first + _BLOCK, n)):
                 for j in range(max(start, i), min(start + _BLOCK, n)):
-                    left = P[begin + i, begin + j] - upper[i, j]
-                    P[begin + i, begin + j] = left
-                    P[begin + j, begin + i] = left
+                    P[begin + i, begin + j] -= upper[i, j]
+                for j in range(max(start, i), min(start + _BLOCK, n)):
+                    P[begin + j, begin + i] = P[begin + i, begin + j]

@@ -8,6 +8,7 @@ by ``P Hᵀ y``.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf
@@ -40,7 +41,7 @@ class Posterior:
         """Which landmarks (M,) it is made of."""
         return self.whitened.used
 
-    @property
+    @cached_property
     def camera(self) -> Camera:
         """After the update."""
         return self.whitened.innovation.at.camera_after(self.change)
@@ -166,10 +167,9 @@ def _linear(found: Posterior) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
     whitened, now = found.whitened, found.whitened.innovation.at
     update = now.update
-    following = update.at(found.camera, found.change[CAMERA:])
     step = (found.change - now.change)[update.measured]
     seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
-    errors = following.z - now.z - (now.own @ seen[:, :, None])[:, :, 0]
+    errors = update.predicted(found.camera, found.change) - now.z - (now.own @ seen[:, :, None])[:, :, 0]
     errors = np.where(now.seen & whitened.used[:, None], errors, 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False

@@ -9,6 +9,7 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
+from backends.ekf.backend import EkfConfig
 from backends.ekf.camera import moved
 from backends.ekf.covariance import CAMERA, HEAD, Covariance
 from backends.ekf.innovation import Update, Whitened
@@ -341,17 +342,22 @@ def far_in_depth(seed: int) -> tuple[FilterState, Update, np.ndarray]:
     P = np.diag(np.concatenate([sigma**2, np.full(6, 0.01), off.ravel() ** 2]))
     marks = FilterLandmarks.at(InverseDepth(), np.arange(n), anchors, known, 0)
     s = replace(s, landmarks=marks, covariance=covariance_of(P))
-    return s, update_of(s, z, InverseDepth(), 5, 1 - 1e-15), truth
+    return s, update_of(s, z, InverseDepth(), EkfConfig().iterations, 1 - 1e-15), truth
 
 
 def test_depths_that_move_do_not_bend_the_pose():
-    """An error of the pose moves landmarks from where they are by now, also where the covariance is transported."""
+    """An error of the pose moves landmarks from where they are by now, also where the covariance is transported.
+
+    Every update comes to its end: after five linearisations one of a hundred was still .17 m off.
+    """
     off = []
-    for seed in range(20):
+    for seed in range(100):
         s, update, truth = far_in_depth(seed)
         after = s.corrected(solve(replace(gate(update), limits=np.full(15, 1e9))))
         off.append(np.linalg.norm(after.pose[:3, 3] - truth[:3, 3]))
-    assert np.sqrt(np.mean(np.square(off))) < 0.035  # .028, as least squares; .047 with the lever of the prior
+    assert (
+        max(off) < 0.1 and np.sqrt(np.mean(np.square(off))) < 0.035
+    )  # .028, as least squares; .047 with the lever of the prior
 
 
 def test_a_coordinate_at_its_limit_has_changed_by_so_much():
