@@ -48,10 +48,6 @@ class Update:
         """Pixel noise [px]."""
         return self.measure.models.pixel_sigma
 
-    def wider(self, noise: Array) -> Update:
-        """With more noise (12, 12) of the camera."""
-        return replace(self, covariance=self.covariance.camera_moved(np.eye(CAMERA), noise))
-
     def facing(self, T: Array) -> Update:
         """With a guess T (4, 4), and the same prior in coordinates that are regular from there to here."""
         camera, J = self.camera.facing(T)
@@ -234,7 +230,7 @@ class Whitened:
         For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off
         by ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so that the distance is ``y_jᵀ Q_j⁻¹ y_j``.
         """
-        columns, Q = self.root.reshape(-1, len(self.used), 3), np.empty((len(self.used), 3, 3))
+        columns, Q = self.root.reshape(-1, len(self.used), 3), np.zeros((len(self.used), 3, 3))
         for i in range(3):
             for j in range(i + 1):
                 Q[:, i, j] = (columns[:, :, i] * columns[:, :, j]).sum(axis=0)

@@ -98,26 +98,6 @@ def test_known_landmarks_are_found_again_after_a_blind_stretch(make, count):
     assert nees(backend, poses[-1]) < chi2.ppf(0.9999, 6)
 
 
-@BOTH
-def test_a_pair_that_is_not_in_step_moves_nothing(make):
-    """The first right images were taken at other times, at 10 m/s: their landmarks contradict all that follows."""
-    poses, rng = path(10, 0.1, 6.7 * FORWARD, STILL), np.random.default_rng(1)
-    models = replace(models_for("driving"), pixel_sigma=0.5, slide=SlideModel())
-    points = cloud(poses, 150, rng, 10.0, 50.0)
-    backend, known = make(RIG, models), set()
-    late = se3.pose(np.eye(3), [0, 0, 0.5])
-    for k, T in enumerate(poses):
-        seen = observe(T, points, 0.5, rng, 150)
-        if k < 2:
-            local = se3.transform(se3.inverse(T @ late if k else T @ se3.inverse(late)), points[seen.ids])
-            seen = Observations(seen.ids, seen.uv_left, RIG.project(local)[1])
-        if k in (1, 2):  # as long as there is nothing else to see
-            seen = seen.select(np.array([i in known for i in seen.ids.tolist()], bool))
-        step(backend, 0.1 * k, seen, known)
-        off = se3.log(se3.inverse(T) @ backend.trajectory().poses[-1])
-        assert np.linalg.norm(off[:5]) < 0.3 and abs(off[5]) < 0.7 * T[2, 3] + 0.1
-
-
 @pytest.mark.parametrize("name, seed", [("ekf", 207), ("iekf", 212), ("ekf", 14), ("ekf", 315), ("iekf", 318)])
 def test_no_landmark_loses_its_variance(name, seed):
     """Calls with gaps of years and landmarks of little parallax: large numbers cancel, or a step has no meaning."""
