@@ -108,7 +108,7 @@ def test_no_landmark_loses_its_variance(name, seed):
 
 
 @BOTH
-@pytest.mark.parametrize("share", [0.1, 0.4])
+@pytest.mark.parametrize("share", [0.1, 0.5])
 def test_wrong_matches_are_found(make, drive, share):
     rng = np.random.default_rng(3)
     backend, known, missed, false, wrong = make(RIG, MODELS), set(), 0, 0, 0
