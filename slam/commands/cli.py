@@ -17,7 +17,6 @@ import typer
 
 from slam.commands.ending import catch_signals, one_line_errors, whole_frames
 from slam.registry import ONLINE
-from slam.runtime.memory import require_address_space
 
 app = typer.Typer(
     help="Stereo SLAM with modified SURF features and interchangeable back ends.",
@@ -74,7 +73,6 @@ def main() -> None:
         handler.setFormatter(logging.Formatter("slam: %(message)s"))
         notes.addHandler(handler)
         notes.propagate = False  # that kernels are compiled is no warning
-        require_address_space()
         app(prog_name="slam")
 
 
