@@ -302,6 +302,18 @@ def render_command(
         print(f"Files: {root}")
 
 
+@app.command("view", short_help="Show a finished run in Rerun.")
+def view_command(
+    folder: Annotated[Path, argument("Left by `slam run`.", "DIR")],
+    target: Annotated[str, option("A window, or a file.", "live|FILE.rrd", "--to")] = "live",
+    overwrite: _Overwrite = False,
+) -> None:
+    """Show a finished run in Rerun: path, objects and map; `slam run --viewer` shows its images, too."""
+    from slam.run.viewer import view_run
+
+    view_run(folder, target, overwrite)
+
+
 @app.command("list", short_help="List back ends, sequences and formats.")
 def list_command(
     options: Annotated[bool, option("Also the options of the built-in sequences.", None, "--options")] = False,
