@@ -78,6 +78,10 @@ def test_a_run_leaves_its_files(tmp_path):
     assert (tuple(rows[0]), tuple(landmarks[0])) == (FRAME_COLUMNS, LANDMARK_COLUMNS)
     assert [r["status"] for r in rows] == ["started"] + ["tracked"] * 11
     assert [int(r["frame"]) for r in rows] == list(range(12))
+    P = {name: float(rows[-1][name]) for name in ("c00", "c11", "c22", "c33", "c44", "c55")}
+    sd = {name: float(rows[-1][f"sd_{name}"]) for name in ("rotation", "x", "y", "z")}
+    assert sd["rotation"] ** 2 == pytest.approx(P["c00"] + P["c11"] + P["c22"], rel=1e-6)
+    assert sum(sd[axis] ** 2 for axis in "xyz") == pytest.approx(P["c33"] + P["c44"] + P["c55"], rel=1e-6)
     assert len(landmarks) == summary["landmarks"] == int(rows[-1]["map_size"])
     assert all(float(r["cxx"]) > 0 for r in landmarks)
     assert (tmp_path / "objects.csv").read_text().strip() == ",".join(OBJECT_COLUMNS)
