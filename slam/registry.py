@@ -91,7 +91,6 @@ def resolve(role: str, name: str) -> Any:
 
 
 def _spoken(role: str) -> str:
-    """A role in words: "back end" or "front end"."""
     return role[:-1].replace("end", " end")
 
 

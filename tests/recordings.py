@@ -22,7 +22,7 @@ rate_hz: 20
 resolution: [{width}, {height}]
 camera_model: pinhole
 intrinsics: [50.0, 51.0, 31.5, 23.5]
-distortion_model: {model}
+distortion_model: radial-tangential
 distortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]
 """
 
@@ -30,10 +30,10 @@ distortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]
 BODY_CAMERA = np.array([[0.0, -1.0, 0.0, 0.02], [1.0, 0.0, 0.0, -0.06], [0.0, 0.0, 1.0, 0.01], [0.0, 0.0, 0.0, 1.0]])
 
 
-def picture(seed: int, width: int = WIDTH, height: int = HEIGHT, depth: type = np.uint8) -> np.ndarray:
+def picture(seed: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     """A picture that is told from others by its mean."""
     noise = np.random.default_rng(seed).integers(0, 4, (height, width))
-    return (10 * (seed + 1) + noise).astype(depth)
+    return (10 * (seed + 1) + noise).astype(np.uint8)
 
 
 def seeds(sequence) -> list[tuple[int | None, int | None]]:
@@ -51,9 +51,9 @@ def rename(folder: Path, name) -> None:
         path.rename(folder / name(i))
 
 
-def write_image(path: Path, seed: int, width: int = WIDTH, height: int = HEIGHT, depth: type = np.uint8) -> None:
+def write_image(path: Path, seed: int, width: int = WIDTH, height: int = HEIGHT) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), picture(seed, width, height, depth))
+    assert cv2.imwrite(str(path), picture(seed, width, height))
 
 
 def cut(path: Path, share: float = 0.5) -> None:
@@ -62,18 +62,18 @@ def cut(path: Path, share: float = 0.5) -> None:
     path.write_bytes(data[: int(len(data) * share)])
 
 
-def write_sensor(path: Path, baseline: float = 0.11, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
+def write_sensor(path: Path, baseline: float = 0.11) -> None:
     """EuRoC's sensor.yaml of a camera `baseline` to the right of camera 0."""
     T = BODY_CAMERA.copy()
     T[:3, 3] += T[:3, 0] * baseline
     path.parent.mkdir(parents=True, exist_ok=True)
     numbers = ", ".join(str(x) for x in T.ravel())
-    path.write_text(SENSOR.format(T=numbers, width=size[0], height=size[1], model="radial-tangential"))
+    path.write_text(SENSOR.format(T=numbers, width=WIDTH, height=HEIGHT))
 
 
-def write_csv(camera: Path, stamps: list[int], ending: str = ".png") -> None:
+def write_csv(camera: Path, stamps: list[int]) -> None:
     camera.mkdir(parents=True, exist_ok=True)
-    lines = ["#timestamp [ns],filename", *(f"{s},{s}{ending}" for s in stamps)]
+    lines = ["#timestamp [ns],filename", *(f"{s},{s}.png" for s in stamps)]
     (camera / "data.csv").write_text("\n".join(lines) + "\n")
 
 

@@ -149,7 +149,6 @@ def _require_pairs(estimate: Trajectory, truth: Trajectory, count: int) -> None:
 
 
 def _motion_errors(estimate: Trajectory, truth: Trajectory, first: np.ndarray, last: np.ndarray) -> PathErrors:
-    """Of the motions between rows `first` and `last`."""
     true = inverse(truth.poses[first]) @ truth.poses[last]
     estimated = inverse(estimate.poses[first]) @ estimate.poses[last]
     return error_sizes(inverse(true) @ estimated)

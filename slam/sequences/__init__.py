@@ -21,7 +21,8 @@ from slam.sequences import euroc, folders, kitti, ros
 from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, logger, read_masks, turned
 from slam.sequences.folders import VIDEO_SUFFIXES
 from slam.sequences.images import IMAGE_SUFFIXES
-from slam.sequences.options import RECORDED, Options, read_options
+from slam.sequences.options import RECORDED, Options
+from slam.settings import read_query
 
 __all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
 
@@ -31,8 +32,6 @@ _LISTED = 6  # sequences below a folder
 
 
 class _Format(NamedTuple):
-    """A format on disk."""
-
     matches: Callable[[Path], bool]  # whether a folder or file looks like it
     open: Callable[[Path, Options, FaultLog], RecordedSequence]
     description: str
@@ -121,7 +120,6 @@ def _open_folder(text: str, format: str | None) -> RecordedSequence:
 
 
 def _open_world(text: str) -> Sequence:
-    """A synthetic world by its text, ``synthetic:`` left out."""
     from slam.worlds import open_world
 
     name, mark, query = text.partition("?")
@@ -129,7 +127,7 @@ def _open_world(text: str) -> Sequence:
     masks = [part for part in parts if part.startswith("mask=")]
     opened = open_world(name + mark + "&".join(part for part in parts if part not in masks))
     if masks:
-        opened.masks = read_masks(read_options(masks[-1])["mask"], Path.cwd(), opened.rig)
+        opened.masks = read_masks(read_query(masks[-1])["mask"], Path.cwd(), opened.rig)
         opened.name = text
     return opened
 
@@ -152,13 +150,12 @@ def _exists(text: str) -> bool:
 
 
 def _format_of(folder: Path) -> str | None:
-    """The first format that a folder or file looks like; None for no sequence."""
     return next((name for name, known in _FORMATS.items() if known.matches(folder)), None)
 
 
 def _format_asked(folder: Path, query: str, text: str) -> str | None:
     """The first format that a folder looks like; what is neither a recording nor a folder of something is refused."""
-    named = read_options(query).keys()
+    named = read_query(query).keys()
     if ros.matches_folder(folder):
         return "ros"
     if not folder.exists():

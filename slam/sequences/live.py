@@ -124,5 +124,4 @@ class LiveFrames:
                 self._changed.notify_all()
 
     def _ending(self) -> bool:
-        """Whether nobody takes frames any more."""
         return self._closed or self._until.is_set()

@@ -14,7 +14,7 @@ from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.files import expanded, write_text
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, pose, so3_exp
+from slam.geometry.se3 import Array, inverse, is_rotation, pose, so3_exp
 from slam.sequences.calibration import Entries, array, naming, plain_name, read_entries
 from slam.sequences.images import Size, recorded_size, size_text
 from slam.sequences.options import value_of
@@ -204,9 +204,8 @@ def projection_offset(P: Array) -> Array:
 
 def rigid(T: Array, name: str) -> Array:
     """The rigid motion (4, 4); CalibrationError where its rotation is none."""
-    R = T[:3, :3]
-    if np.abs(R).max() > 1.01 or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-        raise CalibrationError(f"{name} is not a rigid motion: its rotation is {R.tolist()}")
+    if not is_rotation(T[:3, :3], 1e-3):
+        raise CalibrationError(f"{name} is not a rigid motion: its rotation is {T[:3, :3].tolist()}")
     return T
 
 

@@ -32,7 +32,6 @@ class Changed(EkfBackend):
 
 
 ANSWERS = [
-    ("predict", lambda p: None, "predict: must be of type Prediction"),
     ("predict", lambda p: replace(p, T_world_left=np.full((4, 4), np.nan)), "predict: T_world_left is not finite"),
     (
         "predict",
@@ -40,17 +39,11 @@ ANSWERS = [
         "predict: .* no rotation and translation",
     ),
     ("predict", lambda p: replace(p, covariance=np.eye(3)), "predict: covariance must be an array"),
-    ("predict", lambda p: replace(p, uv_left=p.uv_left[None]), "predict: uv_left"),
     ("update", lambda r: None, "update: must be of type UpdateReport"),
-    ("update", lambda r: replace(r, nis="1"), "update: nis must be of type Real"),
     ("update", lambda r: replace(r, used=r.used.astype(float)), "update: used must be an array"),
-    ("estimate", lambda e: replace(e, stamp=None), "estimate: stamp must be of type Real"),
     ("estimate", lambda e: replace(e, stamp=np.nan), "estimate: stamp must be within"),
-    ("estimate", lambda e: replace(e, positions=None), "estimate: positions must be an array"),
-    ("estimate", lambda e: replace(e, covariance=np.full((6, 6), np.inf)), "estimate: covariance is not finite"),
     ("estimate", lambda e: replace(e, covariance=-np.eye(6)), "estimate: covariance has a negative variance"),
     ("positions", lambda x: x[:-1] if len(x) else None, "positions:? must be (of type|an) (ndarray|array)"),
-    ("positions", lambda x: x * np.nan, "positions is not finite"),
 ]
 
 
@@ -85,10 +78,7 @@ def aligning(**answers) -> StereoSlam:
 
 
 WRONG = [
-    ("patches", lambda p: None, "patches: must be of type Patches"),
-    ("patches", lambda p: replace(p, images=p.images[:1]), "patches: images must be|patches: centres"),
     ("patches", lambda p: Patches(p.images, p.centres[:, :1], p.size), "patches: centres"),
-    ("align", lambda f: None, "align: must be of type tuple"),
     ("align", lambda f: (f[0][:-1], f[1]), "align: must give left and right"),
 ]
 
