@@ -18,10 +18,11 @@ PICTURES = {
     "startup": ("", (0, 75, 149)),
     "box": ("", (10, 120, 220, 360)),
     "boxes": ("", (60, 200, 330)),
+    "people": ("", (5, 45, 85)),
     "street": ("", (10, 125, 190)),
     "town": ("", (150, 870, 1200)),
 }
-WIDE = ("street", "town")  #: worlds whose images are wide
+WIDE = ("people", "street", "town")  #: worlds whose images are wide
 HEIGHT = 300  #: of a frame in a picture [px]
 
 

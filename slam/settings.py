@@ -21,7 +21,7 @@ SETTABLE: dict[str, tuple[str, ...]] = {
     "map": ("target_in_view", "max_landmarks", "max_depth_error", "monocular", "restart_after"),
     "atlas": ("enabled",),
     "self_calibration": ("enabled", "systematic"),
-    "objects": ("mode", "max_speed", "min_speed"),
+    "objects": ("mode", "max_speed", "min_speed", "database"),
     "surf": ("features", "descriptor", "upright", "min_depth", "max_depth", "threads"),
 }
 

@@ -11,6 +11,7 @@ import numpy as np
 from slam import registry
 from slam.atlas.atlas import Atlas
 from slam.atlas.map_io import FIRST_FRAME, SavedMap
+from slam.bodies.config import ObjectsConfig
 from slam.bodies.detector import MovingObjectDetector, ObjectDetector
 from slam.calibration import SavedCalibration, SelfCalibration
 from slam.config import SystemConfig
@@ -24,7 +25,9 @@ from slam.input.features import Rectification, documented, following
 from slam.input.moment import MomentWatch
 from slam.input.warnings import REPEATED
 from slam.interfaces import Backend, Frontend
+from slam.models import EstimatorModels
 from slam.naming import count
+from slam.papers.procedure1 import Procedure1Detector
 from slam.runtime.compilation import Stages
 from slam.runtime.memory import keep_freed_memory
 from slam.runtime.threads import OneThread, one_blas_thread, prefetch
@@ -116,8 +119,7 @@ class StereoSlam:
         self.world_frame = FIRST_FRAME if prior_map is None else prior_map.world_frame
         inside.require_fits(first)
         self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
-        off, restarts = c.objects.mode == "off", names[1] is not None
-        detector = ObjectDetector() if off else MovingObjectDetector(inside.rig, c.objects, inner.models)
+        detector, restarts = _detector_for(inside.rig, c.objects, inner.models), names[1] is not None
         self._tracker = Tracker(inside.rig, inner, self.calibration, first, restarts, detector, self.frontend)
         self._session = Session(self._tracker, names[1])
         self._stages = Stages()
@@ -358,3 +360,9 @@ class StereoSlam:
         """State for copying and pickling; refused while another thread is in a step."""
         with self._stepping:
             return vars(self).copy()
+
+
+def _detector_for(rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> ObjectDetector:
+    """The detector of the configured mode; raises ConfigurationError where its database cannot be read."""
+    detectors = {"detect": MovingObjectDetector, "procedure1": Procedure1Detector}
+    return ObjectDetector() if config.mode == "off" else detectors[config.mode](rig, config, models)

@@ -17,14 +17,14 @@ import slam
 from slam.geometry.trajectory import Trajectory
 from slam.worlds.export import write_euroc
 from tests.recordings import write_storage, write_video
-from tests.test_docs import DOCS, PAGES, ROOT, commands
+from tests.test_docs import DOCS, PAGES, ROOT, blocks, commands
 
 pytestmark = pytest.mark.slow
 
 FEW = 4  # frames
 SHELLS = ("sh", "shell", "bash")  # consoles have tests of their own
 #: First words of what installs, tests or builds the package itself: `.ci/run` does all of it.
-OF_THE_PACKAGE = {"pip", "pytest", "ruff", "mypy", "mkdocs", "pre-commit", "python3", ".", ".ci/run"}
+OF_THE_PACKAGE = {"git", "cd", "pip", "pytest", "ruff", "mypy", "mkdocs", "pre-commit", "python3", ".", ".ci/run"}
 #: A camera, recordings of ROS, and timings.
 NOT_AT_HAND = re.compile(r"^camera:|\.(bag|mcap|db3)(\?|$)|^walk_folder$|^benchmarks/")
 #: What the page shows, and what is run in its place.
@@ -104,6 +104,9 @@ def test_commands_run(page, reader, slam_command, tmp_path, monkeypatch):
     shutil.copytree(reader, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))  # a back end of the working folder adds to it
+    if page.name == "objects.md":  # the database that its Python saves
+        (code,) = [block for block in blocks(page, "python") if "ObjectDatabase" in block]
+        exec(compile(code, page.name, "exec", dont_inherit=True), {})
     for words in commands(page, *SHELLS):
         if words[0] in OF_THE_PACKAGE or words[:3] == ["python", "-m", "tests.fuzz"]:
             continue  # hostile input has tests of its own

@@ -25,11 +25,12 @@ MAY_IMPORT = {
     "calibration": {"tracks", "window", "data", "geometry", "kernels", "runtime"},
     "atlas": {"tracks", "window", "data", "geometry", "runtime"},
     "bodies": {"window", "tracks", "data", "geometry", "kernels", "runtime"},
+    "papers": {"bodies", "tracks", "data", "geometry", "runtime"},
     "worlds": {"data", "geometry"},
     "sequences": {"worlds", "data", "geometry"},
     "evaluation": {"data", "geometry"},
     "input": {"tracks", "data", "geometry", "runtime"},
-    "system": {"bodies", "atlas", "tracks", "calibration", "input", "data", "geometry", "runtime"},
+    "system": {"papers", "bodies", "atlas", "tracks", "calibration", "input", "data", "geometry", "runtime"},
     "run": {
         "system", "calibration", "bodies", "atlas", "tracks", "window", "input", "sequences", "worlds", "evaluation",
         "data", "geometry", "runtime",

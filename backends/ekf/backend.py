@@ -39,7 +39,7 @@ class EkfConfig:
 
     papers: bool = False
     measurement: str = "stereo"
-    iterations: int = 5
+    iterations: int = 20
     landmarks: str = "inverse_depth"
     consistent: bool = True
 

@@ -17,48 +17,46 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg.blas import dsyr2k, dsyrk
 
-from backends.ekf.kernels import gather
+from backends.ekf.kernels import lessen
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
 
 CAMERA = 12  #: fixed: size of the camera's state [r, φ, v, ω]
 POSE = 6  #: fixed: its part [r, φ] that measurements depend on
+RECENT = 4  #: cost: poses before the present one that are kept
+HEAD = CAMERA + POSE * RECENT  #: fixed: size of camera and last poses, behind which the landmarks stand
 
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Of ``[camera (12), last poses (6K), B landmarks that are parked (3B), A that are in the state (3A)]``, n numbers.
+    """Of ``[camera (12), last poses (24), B landmarks that are parked (3B), A that are in the state (3A)]``, n numbers.
 
-    The poses are perturbed on the right, the newest first. Rows of the table of landmarks are in this order; behind
-    them are those that are known from elsewhere.
+    The poses are perturbed on the right, the newest first; zero before there are so many. Rows of the table of
+    landmarks are in this order; behind them are those that are known from elsewhere.
     """
 
     P: Array  # (n, n)
     by_rig: Array  # derivatives (n, m) of all errors by those of the rig
     known: Array  # (C, 3, 3), of each landmark that is independent of all else
-    poses: int = 0  # K
     parked: int = 0  # B
 
     @classmethod
     def of_camera(cls, P: Array, by_rig: Array | None = None) -> Covariance:
         """Of the camera alone (12, 12), with derivatives (12, m) of its error by errors of the rig."""
-        return cls(P, np.zeros((CAMERA, 0)) if by_rig is None else by_rig, np.zeros((0, 3, 3)))
-
-    @property
-    def first(self) -> int:
-        """12 + 6K: where the landmarks begin."""
-        return CAMERA + POSE * self.poses
+        by_rig, more = np.zeros((CAMERA, 0)) if by_rig is None else by_rig, (0, HEAD - CAMERA)
+        return cls(np.pad(P, more), np.pad(by_rig, (more, (0, 0))), np.zeros((0, 3, 3)))
 
     @property
     def begin(self) -> int:
-        """12 + 6K + 3B: where the landmarks of the state begin."""
-        return self.first + 3 * self.parked
+        """36 + 3B: where the landmarks of the state begin."""
+        return HEAD + 3 * self.parked
 
     @property
     def correlated(self) -> int:
         """B + A: the landmarks after these are known from elsewhere."""
-        return (len(self.P) - self.first) // 3
+        return (len(self.P) - HEAD) // 3
 
     @property
     def camera(self) -> Array:
@@ -72,7 +70,7 @@ class Covariance:
 
     def numbers(self, rows: IndexArray) -> IndexArray:
         """Where the coordinates (M, 3) of landmarks stand, by rows of the table."""
-        return np.asarray(self.first + 3 * rows[:, None] + np.arange(3))
+        return np.asarray(HEAD + 3 * rows[:, None] + np.arange(3))
 
     def marginals(self, rows: IndexArray) -> tuple[Array, Array]:
         """Covariances (M, 3, 3) of landmarks, and theirs (M, 3, 6) with the camera's [r, φ]; by rows of the table."""
@@ -97,38 +95,32 @@ class Covariance:
         P[:, -POSE:] = P[:, -POSE:] @ J.T
         return np.asarray(0.5 * (P + P.T))
 
-    def _arranged(self, order: IndexArray) -> Covariance:
-        """With the numbers in another order (n',), each as often as it stands there; −1 for new ones, with zeros."""
-        by_rig = gather(self.by_rig, order, np.arange(self.by_rig.shape[1]))
-        return replace(self, P=gather(self.P, order, order), by_rig=by_rig)
-
     # --- the camera moves ---
 
-    def advanced(self, by_error: Array, most: int, J: Array, noise: Array) -> Covariance:
+    def advanced(self, by_error: Array, J: Array, noise: Array) -> Covariance:
         """After a motion of the camera, see `camera_moved`.
 
-        Its pose before, `by_error` (6, 6) times [r, φ], is the first of the last ones; at most so many are kept.
+        Its pose before, `by_error` (6, 6) times [r, φ], is the first of the last ones now; the last of them goes.
         """
-        kept = min(self.poses, most - 1)
-        n, end = np.arange(len(self.P)), CAMERA + POSE * kept
-        new = self._arranged(np.concatenate([n[:CAMERA], n[:POSE], n[CAMERA:end], n[self.first :]]))
-        at = slice(CAMERA, CAMERA + POSE)
-        new.P[at], new.by_rig[at] = by_error @ new.P[at], by_error @ new.by_rig[at]
-        new.P[:, at] = new.P[:, at] @ by_error.T
-        return replace(new, poses=kept + 1)._move(J, noise)
+        F = np.eye(HEAD, k=-POSE)
+        F[:CAMERA, :CAMERA], F[CAMERA : CAMERA + POSE, :CAMERA] = J, np.pad(by_error, ((0, 0), (0, POSE)))
+        return self._moved(F, noise)
 
     def camera_moved(self, J: Array, noise: Array) -> Covariance:
         """The camera's error (12,) becomes J times what it was, plus noise (12, 12)."""
-        return replace(self, P=self.P.copy(), by_rig=self.by_rig.copy())._move(J, noise)
+        F = np.eye(HEAD)
+        F[:CAMERA, :CAMERA] = J
+        return self._moved(F, noise)
 
-    def _move(self, J: Array, noise: Array) -> Covariance:
-        """The same, in place."""
-        P, by_rig = self.P, self.by_rig
-        P[:CAMERA], by_rig[:CAMERA] = J @ P[:CAMERA], J @ by_rig[:CAMERA]
-        own = P[:CAMERA, :CAMERA] @ J.T + noise
-        P[:CAMERA, :CAMERA] = 0.5 * (own + own.T)
-        P[CAMERA:, :CAMERA] = P[:CAMERA, CAMERA:].T
-        return self
+    def _moved(self, F: Array, noise: Array) -> Covariance:
+        """The errors (36,) of camera and last poses become F times what they were; the camera's has more noise."""
+        P, by_rig = self.P.copy(), self.by_rig.copy()
+        P[:HEAD], by_rig[:HEAD] = F @ P[:HEAD], F @ by_rig[:HEAD]
+        own = P[:HEAD, :HEAD] @ F.T
+        own[:CAMERA, :CAMERA] += noise
+        P[:HEAD, :HEAD] = 0.5 * (own + own.T)
+        P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
+        return replace(self, P=P, by_rig=by_rig)
 
     # --- landmarks join and leave ---
 
@@ -146,25 +138,24 @@ class Covariance:
         They are the last ones of the state. With the pose known, errors of the rig move them by `by_rig` (M, 3, m).
         """
         n, each, by_pose = len(self.P), np.arange(len(J)), J.reshape(-1, POSE)
-        new = self._arranged(np.append(np.arange(n), np.full(len(by_pose), -1)))
-        new.P[n:, :n] = by_pose @ self.P[:POSE]
-        new.P[:n, n:] = new.P[n:, :n].T
-        own = new.P[n:, :POSE] @ by_pose.T
+        P, cross = np.empty((n + len(by_pose),) * 2), by_pose @ self.P[:POSE]
+        P[:n, :n], P[n:, :n], P[:n, n:] = self.P, cross, cross.T
+        own = cross[:, :POSE] @ by_pose.T
         own.reshape(len(J), 3, len(J), 3)[each, :, each] += noise
-        new.P[n:, n:] = positive(0.5 * (own + own.T), own.diagonal(), POSE)
-        new.by_rig[n:] = by_pose @ self.by_rig[:POSE] + by_rig.reshape(len(by_pose), -1)
-        return new
+        P[n:, n:] = positive(0.5 * (own + own.T), own.diagonal(), POSE)
+        moved = by_pose @ self.by_rig[:POSE] + by_rig.reshape(len(by_pose), -1)
+        return replace(self, P=P, by_rig=np.concatenate([self.by_rig, moved]))
 
     def rearranged(self, parked: IndexArray, state: IndexArray, known: IndexArray) -> Covariance:
         """With other landmarks in each of its parts, or fewer; by their rows of the table of landmarks."""
         rows = np.concatenate([parked, state])
         joining = np.flatnonzero(rows >= self.correlated)
-        numbers = self.numbers(rows)
-        numbers[joining] = -1
-        new = self._arranged(np.append(np.arange(self.first), numbers))
-        at = self.numbers(joining)
-        new.P[at[:, :, None], at[:, None, :]] = self.known[rows[joining] - self.correlated]
-        return replace(new, known=self.known[known - self.correlated], parked=len(parked))
+        numbers = np.append(np.arange(HEAD), self.numbers(rows)).clip(max=len(self.P) - 1)
+        P = np.ascontiguousarray(self.P[numbers].T)[numbers]  # rows alone are copied fast
+        by_rig, at = self.by_rig[numbers], self.numbers(joining)
+        P[at], P[:, at], by_rig[at] = 0.0, 0.0, 0.0
+        P[at[:, :, None], at[:, None, :]] = self.known[rows[joining] - self.correlated]
+        return replace(self, P=P, by_rig=by_rig, known=self.known[known - self.correlated], parked=len(parked))
 
     # --- an update ---
 
@@ -179,20 +170,18 @@ class Covariance:
             J: the camera's error becomes J (12, 12) times what it was,
             shift: and then to those of the state's landmarks this (A, 3, 6) times that of the pose is added.
         """
-        P, by_rig, b, shift = np.empty_like(self.P), self.by_rig.copy(), self.begin, shift.reshape(-1, POSE)
-        P[:b] = self.P[:b]
+        P, by_rig, b, shift = self.P.copy(), self.by_rig.copy(), self.begin, shift.reshape(-1, POSE)
         P[:CAMERA] -= V[:CAMERA] @ V.T
         P[CAMERA:b, b:] -= V[CAMERA:b] @ V[b:].T
         by_rig[:CAMERA], by_rig[b:] = by_rig[:CAMERA] - V[:CAMERA] @ lost_by_rig, by_rig[b:] - V[b:] @ lost_by_rig
         P[:CAMERA], by_rig[:CAMERA] = J @ P[:CAMERA], J @ by_rig[:CAMERA]
         moved = P[:CAMERA, :CAMERA] @ J.T
         own = positive(0.5 * (moved + moved.T), self.camera.diagonal(), V.shape[1])
-        half = P[:POSE, b:].T + 0.5 * shift @ own[:POSE, :POSE]
-        gone = V[b:] @ V[b:].T
-        gone -= np.hstack([half, shift]) @ np.hstack([shift, half]).T
-        np.subtract(self.P[b:, b:], gone, out=P[b:, b:])
-        summands = self.P.diagonal()[b:] + ((shift @ own[:POSE, :POSE]) * shift).sum(axis=1)
-        positive(P[b:, b:], summands, V.shape[1])
+        by_shift = shift @ own[:POSE, :POSE]
+        gone = dsyrk(1.0, V[b:], lower=1)
+        gone = dsyr2k(-1.0, P[:POSE, b:].T + 0.5 * by_shift, shift, 1.0, gone, lower=1, overwrite_c=1)
+        lessen(P, b, gone.T)
+        positive(P[b:, b:], self.P.diagonal()[b:] + (by_shift * shift).sum(axis=1), V.shape[1])
         P[:CAMERA, :CAMERA] = own
         P[CAMERA:b, :CAMERA] = P[:CAMERA, CAMERA:b].T
         P[:b, b:] += P[:b, :POSE] @ shift.T
@@ -206,7 +195,7 @@ class Covariance:
         """
         by_rig = self.by_rig.copy()
         by_rig[self.numbers(rows).ravel(), -1:] -= change.reshape(-1, 1)
-        nothing = np.zeros((len(self.P), 0)), np.zeros((0, by_rig.shape[1]))
+        nothing = np.zeros((len(self.P), 1)), np.zeros((1, by_rig.shape[1]))
         return replace(self, by_rig=by_rig).corrected(*nothing, np.eye(CAMERA), shift)
 
 

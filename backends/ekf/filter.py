@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from backends.ekf.camera import Camera, moved
-from backends.ekf.covariance import CAMERA, POSE, Covariance, positive
+from backends.ekf.covariance import CAMERA, POSE, RECENT, Covariance, positive
 from backends.ekf.innovation import UnsolvableError, Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from backends.ekf.recovery import agreement
@@ -125,7 +125,8 @@ class LandmarkFilter:
 
         Raises MeasurementError before the first `predict`, or where n is less than one.
         """
-        s, n = self._started("recent"), min(require_recent(self.name, n), 1 + self.state.covariance.poses)
+        s = self._started("recent")
+        n = min(require_recent(self.name, n), s.frame + 1, RECENT + 1)
         return RecentPoses(*self._path(n), s.covariance.joint_poses(s.camera.by_error(), n))
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---

@@ -48,10 +48,6 @@ class Update:
         """Pixel noise [px]."""
         return self.measure.models.pixel_sigma
 
-    def wider(self, noise: Array) -> Update:
-        """With more noise (12, 12) of the camera."""
-        return replace(self, covariance=self.covariance.camera_moved(np.eye(CAMERA), noise))
-
     def facing(self, T: Array) -> Update:
         """With a guess T (4, 4), and the same prior in coordinates that are regular from there to here."""
         camera, J = self.camera.facing(T)
@@ -86,6 +82,12 @@ class Update:
         Z = dpotrs(root, N, lower=1)[0] if info == 0 else np.full(N.shape, np.nan)
         return np.linalg.solve(N.T @ Z, Z.T) if np.isfinite(Z).all() else None
 
+    def predicted(self, camera: Camera, change: Array) -> Array:
+        """What a camera would measure (M, 3) [px] of landmarks after a change of the state (n,); NaN behind it."""
+        marks, asked = self.landmarks, change[self.measured[POSE:]].reshape(-1, 3)
+        points = self.coordinates.points(marks.anchors, self.coordinates.moved(marks.c, asked))
+        return self.measure.stereo.project((points - camera.pose[:3, 3]) @ camera.pose[:3, :3])[0]
+
     def at(self, camera: Camera | None = None, moved: Array | None = None) -> Linearisation:
         """Linearised at a camera and a change (3A,) of the state's landmarks, by default those of the prior.
 
@@ -103,72 +105,64 @@ class Update:
             change[self.measured[POSE:]] = (marks.c - self.landmarks.c).reshape(-1)  # a coordinate may be at its limit
         R, r = there.pose[:3, :3], there.pose[:3, 3]
         z, by_point = self.measure.stereo.project((marks.points - r) @ R)
+        seen = np.isfinite(self.z) & np.isfinite(z).all(axis=1, keepdims=True)
         own = by_point @ (R.T @ self.coordinates.jacobian(marks.anchors, marks.c))
+        own = np.where(seen[:, :, None], own, 0.0)
         lever = self.lever if camera is None is moved else marks.gauge @ (there.world() @ J[:POSE, :POSE])
-        return Linearisation(self, there, J, change, z, own, lever)
+        return Linearisation(self, there, J, change, z, seen, own, lever)
 
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """An update's measurements, linearised somewhere."""
+    """An update's measurements, linearised somewhere.
+
+    If the camera transports its error, the prior has a displacement of the world as N, its derivative at the prior.
+    Elsewhere that is not quite one: ``H N = B`` is not zero, and the update would measure it. H is therefore taken of
+    what else there is of an error, ``H − B A`` with A N = 1; or, where there is no A, with the prior's lever.
+    """
 
     update: Update
     camera: Camera
     J: Array  # (12, 12): an error of the prior's camera is J times that, as an error of this one
     change: Array  # of the state (n,) from the prior to here, in the prior's coordinates
     z: Array  # what is predicted here (M, 3) [px], NaN behind a camera
-    own: Array  # its derivatives (M, 3, 3) by the coordinates
+    seen: BoolArray  # components (M, 3) that are measured, of landmarks before both cameras
+    own: Array  # derivatives (M, 3, 3) of what is predicted by each landmark's coordinates, zero for others
     lever: Array  # (M, 3, 6), see the module
 
     def camera_after(self, change: Array) -> Camera:
         """The camera after a change of the state (n,) from the prior."""
         return self.camera.moved(self.J @ (change - self.change)[:CAMERA])
 
-    def seen(self) -> BoolArray:
-        """Components (M, 3) that are measured, of landmarks before both cameras."""
-        return np.asarray(np.isfinite(self.update.z) & np.isfinite(self.z).all(axis=1, keepdims=True))
+    @cached_property
+    def _along_the_world(self) -> tuple[Array, Array, Array | None]:
+        """H by the pose's error (3M, 6), and B (3M, 6) and A (6, 6 + 3M)."""
+        update, lever, A = self.update, self.lever, None
+        B = (self.own @ (update.lever - lever)).reshape(-1, POSE)
+        if update.camera.transports and B.any():
+            A, lever = update.place, lever if update.place is not None else update.lever
+        return -(self.own @ lever).reshape(-1, POSE), B, A
+
+    def times(self, X: Array) -> Array:
+        """H (3M, ·) of a matrix X (6 + 3M, ·), whose rows are of the errors of pose and measured landmarks."""
+        by_pose, B, A = self._along_the_world
+        out = by_pose @ X[:POSE]
+        out += (self.own @ X[POSE:].reshape(len(self.own), 3, -1)).reshape(out.shape)
+        return np.asarray(out if A is None else out - B @ (A @ X))
 
     def innovation(self) -> Innovation:
-        """ν and S of what is measured.
-
-        If the camera transports its error, the prior has a displacement of the world as N, its derivative at the prior.
-        Elsewhere that is not quite one: ``H N = B`` is not zero, and the update would measure it. H is therefore taken
-        of what else there is of an error, ``H − B A`` with A N = 1; or, where there is no A, with the prior's lever.
-        """
+        """ν and S of what is measured."""
         update, P = self.update, self.update.covariance.P
-        seen = self.seen()
-        own = np.where(seen[:, :, None], self.own, 0.0)
-        B, A, lever = (own @ (update.lever - self.lever)).reshape(-1, POSE), None, self.lever
-        if update.camera.transports and B.any():
-            A, lever = update.place, self.lever if update.place is not None else update.lever
-        H = Jacobian(own, -(own @ lever).reshape(-1, POSE), B, A)
-        nu = np.where(seen, update.z - self.z, 0.0).reshape(-1) + H.times(self.change[update.measured, None])[:, 0]
+        nu = np.where(self.seen, update.z - self.z, 0.0).reshape(-1)
+        nu += self.times(self.change[update.measured, None])[:, 0]
         numbers = np.append(np.arange(POSE), update.numbers)
-        HP = H.times(P[numbers])
-        S = H.times(HP[:, numbers].T)
+        HP = self.times(P[numbers])
+        S = self.times(HP[:, numbers].T)
         S[np.diag_indices(len(S))] += update.sigma**2
         upper, info = dpotrf(S.T)  # of the transpose, which is in the order that LAPACK wants
         if info != 0:
             raise UnsolvableError("the innovation covariance is not positive definite")
-        return Innovation(self, seen, H, HP, nu, S, upper_inverse(upper).T)
-
-
-@dataclass(frozen=True, eq=False)
-class Jacobian:
-    """H (3M, 6 + 3M), by the errors of pose and measured landmarks."""
-
-    own: Array  # derivatives (M, 3, 3) of each landmark's measurement by its own coordinates
-    by_pose: Array  # and (3M, 6) by the pose's error
-    B: Array  # (3M, 6), see `Linearisation.innovation`
-    A: Array | None  # (6, 6 + 3M)
-
-    def times(self, X: Array) -> Array:
-        """H (3M, ·) of a matrix X (6 + 3M, ·)."""
-        out = self.by_pose @ X[:POSE]
-        out += (self.own @ X[POSE:].reshape(len(self.own), 3, -1)).reshape(out.shape)
-        if self.A is not None:
-            out -= self.B @ (self.A @ X)
-        return np.asarray(out)
+        return Innovation(self, HP, nu, S, upper_inverse(upper).T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +170,6 @@ class Innovation:
     """ν and its covariance S (paper A, Eq. 11)."""
 
     at: Linearisation
-    seen: BoolArray  # components (M, 3) that are measured
-    H: Jacobian
     HP: Array  # H P (3M, n), with everything
     nu: Array  # innovation of the prior's mean (3M,)
     S: Array  # its covariance (3M, 3M)
@@ -224,12 +216,12 @@ class Whitened:
 
     def gain_root(self) -> tuple[Array, Array]:
         """V (n, 3M) with ``V Vᵀ = K S Kᵀ``, and ``root`` times derivatives of ν by errors of the rig."""
-        nu, update = self.innovation, self.innovation.at.update
-        V = dtrmm(1.0, nu.inverse.T, nu.HP.T, side=1)
+        at, update = self.innovation.at, self.innovation.at.update
+        V = dtrmm(1.0, self.innovation.inverse.T, self.innovation.HP.T, side=1)
         if self.A.size:
             V -= (V @ self.A) @ self.A.T
-        by_rig = nu.H.times(update.covariance.by_rig[np.append(np.arange(POSE), update.numbers)])
-        by_rig -= np.where(nu.seen[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
+        by_rig = at.times(update.covariance.by_rig[np.append(np.arange(POSE), update.numbers)])
+        by_rig -= np.where(at.seen[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
         return V, self.root @ by_rig
 
     def distances(self) -> Array:
@@ -238,9 +230,12 @@ class Whitened:
         For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off
         by ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so that the distance is ``y_jᵀ Q_j⁻¹ y_j``.
         """
-        columns = np.ascontiguousarray(self.root.reshape(-1, len(self.used), 3).transpose(1, 2, 0)[self.used])
+        columns, Q = self.root.reshape(-1, len(self.used), 3), np.zeros((len(self.used), 3, 3))
+        for i in range(3):
+            for j in range(i + 1):
+                Q[:, i, j] = (columns[:, :, i] * columns[:, :, j]).sum(axis=0)
         found = np.zeros(len(self.used))
-        found[self.used] = squared_distances(self.y.reshape(-1, 3)[self.used], columns @ columns.transpose(0, 2, 1))
+        found[self.used] = squared_distances(self.y.reshape(-1, 3)[self.used], Q[self.used])  # of lower triangles
         if not np.isfinite(found).all():
             raise UnsolvableError("the innovation covariance is not positive definite")
         return found

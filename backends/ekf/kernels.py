@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from slam.runtime.compilation import kernel
+
+_BLOCK = 32  # cost: rows and columns that are gone through together, as half of the places are far apart in memory
 
 
 @kernel
-def gather(P, rows, columns):
-    """P (n, m) at some rows and columns, zero where they are −1."""
-    out = np.zeros((len(rows), len(columns)))
-    for i in range(len(rows)):
-        if rows[i] >= 0:
-            for j in range(len(columns)):
-                if columns[j] >= 0:
-                    out[i, j] = P[rows[i], columns[j]]
-    return out
+def lessen(P, begin, upper):
+    """Subtract a symmetric matrix, given by its upper triangle, from P (n, n) in place, from row `begin` on."""
+    n = len(upper)
+    for first in range(0, n, _BLOCK):
+        for start in range(first, n, _BLOCK):
+            for i in range(first, min(first + _BLOCK, n)):
+                for j in range(max(start, i), min(start + _BLOCK, n)):
+                    P[begin + i, begin + j] -= upper[i, j]
+                for j in range(max(start, i), min(start + _BLOCK, n)):
+                    P[begin + j, begin + i] = P[begin + i, begin + j]

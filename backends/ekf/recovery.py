@@ -12,9 +12,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
+from backends.ekf.covariance import CAMERA
 from backends.ekf.innovation import UnsolvableError, Update
 from backends.ekf.solve import Gated, Posterior, gate, solve
 from slam.geometry import se3
@@ -61,7 +63,8 @@ def _restarted(update: Update, search: Search, least: int) -> Posterior | None:
     models, before = update.measure.models, update.camera.pose
     far, turned = np.linalg.norm(T[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ T[:3, :3])
     sigmas = far, turned, models.initial_velocity_sigma, models.initial_angular_velocity_sigma
-    there = update.facing(T).wider(np.diag(np.repeat(np.array(sigmas, float) ** 2, 3)))
+    there, noise = update.facing(T), np.diag(np.repeat(np.array(sigmas, float) ** 2, 3))
+    there = replace(there, covariance=there.covariance.camera_moved(np.eye(CAMERA), noise))
     with suppress(UnsolvableError):
         found = solve(gate(there, T))
         return found if found is not None and found.used.sum() >= least else None

@@ -8,6 +8,7 @@ by ``P Hᵀ y``.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf
@@ -40,7 +41,7 @@ class Posterior:
         """Which landmarks (M,) it is made of."""
         return self.whitened.used
 
-    @property
+    @cached_property
     def camera(self) -> Camera:
         """After the update."""
         return self.whitened.innovation.at.camera_after(self.change)
@@ -122,7 +123,7 @@ def _predicted(found: Posterior, gated: Gated) -> BoolArray:
     used ones is ``ν − Xᵀ w``, and its covariance ``S − Xᵀ X``.
     """
     nu, agree = found.whitened.innovation, np.zeros(len(found.used), bool)
-    out = np.flatnonzero(~found.used & nu.seen.any(axis=1) & np.isfinite(gated.distances))
+    out = np.flatnonzero(~found.used & nu.at.seen.any(axis=1) & np.isfinite(gated.distances))
     if len(out):
         numbers = (3 * out[:, None] + np.arange(3)).ravel()
         X = found.whitened.root @ nu.S[:, numbers]
@@ -150,7 +151,7 @@ def _iterate(innovation: Innovation, used: BoolArray) -> Posterior:
             innovation = update.at(update.camera.at(update.guess)).innovation()
         elif posterior is not None:
             innovation = update.at(posterior.camera, posterior.change[CAMERA:]).innovation()
-        used = used & innovation.seen.any(axis=1)
+        used = used & innovation.at.seen.any(axis=1)
         whitened = innovation.whitened(used)
         change = np.delete(whitened.y @ innovation.HP, np.s_[CAMERA : update.covariance.begin])
         if not np.isfinite(change).all():
@@ -166,11 +167,10 @@ def _linear(found: Posterior) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
     whitened, now = found.whitened, found.whitened.innovation.at
     update = now.update
-    following = update.at(found.camera, found.change[CAMERA:])
     step = (found.change - now.change)[update.measured]
     seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
-    errors = following.z - now.z - (now.own @ seen[:, :, None])[:, :, 0]
-    errors = np.where(whitened.innovation.seen & whitened.used[:, None], errors, 0.0)
+    errors = update.predicted(found.camera, found.change) - now.z - (now.own @ seen[:, :, None])[:, :, 0]
+    errors = np.where(now.seen & whitened.used[:, None], errors, 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
     shift = (whitened.root @ errors.reshape(-1)) @ whitened.by_pose

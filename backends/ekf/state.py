@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from backends.ekf.camera import Camera, Motion
-from backends.ekf.covariance import CAMERA, Covariance
+from backends.ekf.covariance import CAMERA, HEAD, Covariance
 from backends.ekf.innovation import UnsolvableError
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from backends.ekf.solve import Posterior
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
 
-RECENT = 4  #: cost: poses before the present one that are kept
 _MOST, _LEAST = 300, 250  # cost: landmarks of the state above which some leave it, and that are left in it then
 
 
@@ -54,7 +53,7 @@ class FilterState:
     def advanced(self, stamp: float, motion: Motion) -> FilterState:
         """At a later time, after a motion of the camera."""
         camera, J, noise = motion
-        covariance = self.covariance.advanced(self.camera.by_error(), RECENT, J, noise)
+        covariance = self.covariance.advanced(self.camera.by_error(), J, noise)
         return replace(
             self, stamp=stamp, frame=self.frame + 1, closed=False, camera=camera, covariance=covariance
         )  # fmt: skip
@@ -168,7 +167,7 @@ class FilterState:
         marks.seen[update.rows[found.used]] = self.frame
         J, shift = update.camera.transport(camera), self._shift(marks, camera)
         covariance = update.covariance.corrected(*found.whitened.gain_root(), J, shift)
-        if not (covariance.P.diagonal()[covariance.first :] > 0).all():
+        if not (covariance.P.diagonal()[HEAD:] > 0).all():
             raise UnsolvableError("a landmark's variance would not stay positive")
         return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()
 
@@ -177,6 +176,8 @@ class FilterState:
 
         What moves them is an error of the rig, the last that is considered, and none of the state's.
         """
+        if not len(ids):
+            return self
         s = self.with_all_of(ids)
         rows, before = s.landmarks.rows_of(ids), s.landmarks
         marks = before.moved(coordinates, rows, coordinates.of(before.anchors[rows], points) - before.c[rows])

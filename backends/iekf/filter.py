@@ -116,7 +116,7 @@ class IekfConfig:
         ConfigurationError: a value is out of its range.
     """
 
-    iterations: int = 5
+    iterations: int = 20
 
     def __post_init__(self) -> None:
         require_positive(self, {"iterations": (1, 1000)}, "iekf")

@@ -11,7 +11,7 @@ import numpy as np
 from backends.smoother.config import SmootherConfig
 from backends.smoother.factors import FactorMaker
 from backends.smoother.graph import Graph
-from backends.smoother.mending import corrected, path_solved, rebuilt
+from backends.smoother.mending import corrected, rebuilt
 from backends.smoother.path import Path
 from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
@@ -60,8 +60,6 @@ class SmootherBackend:
         self._graph = Graph(self.factor_maker, self.config.lag)
         self.state = SmootherState.empty(np.zeros((6, 0)))
         self.path = Path()
-        self._mended = False  # whether measurements were revised while poses were kept
-        self._answer: tuple[SmootherState, Trajectory] | None = None  # the last path, and the state that it is of
 
     @property
     def rebuilds(self) -> int:
@@ -138,16 +136,8 @@ class SmootherBackend:
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
-        """See `slam.interfaces.Backend.trajectory`: poses that have left the lag are final.
-
-        After a revision of the measurements, all poses whose measurements are kept are solved for together. The newest
-        pose stays where it is and the path before it moves, but where landmarks are known in the world.
-        """
-        s = self.state
-        if self._answer is None or self._answer[0] is not s:
-            graph = path_solved(s, self.factor_maker, self.path.graph(s.first)) if self._mended else None
-            self._answer = s, self.path.trajectory(s, graph)
-        return Trajectory(self._answer[1].stamps.copy(), self._answer[1].poses.copy())
+        """See `slam.interfaces.Backend.trajectory`: poses that have left the lag are final."""
+        return self.path.trajectory(self.state)
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
@@ -184,15 +174,15 @@ class SmootherBackend:
 
     @property
     def revises_path(self) -> bool:
-        """See `slam.interfaces.RevisingBackend`: True while the first frame's measurements are still known."""
-        return self.state.first == self.state.begun == 0
+        """See `slam.interfaces.RevisingBackend`: True while the first pose has not left the lag."""
+        return self._graph.oldest(self.state) == 0
 
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:
         """See `slam.interfaces.RevisingBackend.revise`: the newest pose stays where it is.
 
-        The graph is built anew from corrected measurements, and landmarks move to where they put them. The path is
-        found anew when it is asked for.
+        The graph is built anew from corrected measurements, and landmarks move to where they put them. Poses that have
+        left the lag move as a whole: the path does not part there.
         """
         s = self.state
         if s.started:
@@ -203,7 +193,7 @@ class SmootherBackend:
                 by_rig[:, :, -1:] -= (s.landmarks.position - before.landmarks.position)[:, :, None]
                 s = replace(s, landmarks=replace(s.landmarks, by_rig=by_rig))
             path = self.path.moved(s, s.poses[0] @ inverse(before.poses[0]))
-            self.path, self.state, self._mended = path, replace(s, measured=True), True
+            self.path, self.state = path, replace(s, measured=True)
 
     # --- copies ---
 

@@ -1,4 +1,4 @@
-"""Measurements that are mended: the last poses, or all that are kept, are solved for again."""
+"""Measurements that are mended: the poses of the lag are solved for again."""
 
 from __future__ import annotations
 
@@ -8,16 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from backends.smoother.factors import FactorMaker, pose_key
-from backends.smoother.graph import Graph, SolverError, held, minimised
+from backends.smoother.graph import Graph, SolverError
 from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
-from backends.smoother.tracks import GraphProblem, Tracks
 from slam.geometry.se3 import Array, inverse, transform
 from slam.window.stereo import RectifiedStereo
 
 _AGAIN = 2  # numerics: steps of Gauss and Newton after the first
-_ITERATIONS = 20  # numerics: of Levenberg-Marquardt at most
 
 
 def corrected(s: SmootherState, correct: Callable[[Array], Array]) -> SmootherState:
@@ -55,23 +52,3 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     last[0] = moved[at] @ inverse(s.poses[at]) @ s.last[0]
     marks = marks.refined(steps.stereo, steps.models.pixel_sigma, s.first, moved)
     return replace(s, poses=moved, last=last, landmarks=marks)
-
-
-def path_solved(s: SmootherState, make: FactorMaker, before: Array) -> Array:
-    """All poses of the graph, those that are kept solved for together; as they are where that fails.
-
-    The newest pose stays where it is, and the path moves, but where landmarks are known in the world. Those that are
-    kept no more are `before` (N, 4, 4).
-    """
-    first = max(s.begun, s.first)
-    problem, tracks, kept = GraphProblem(), Tracks(make, None), s.poses.copy()
-    problem.factors.add(make.prior(first, s.poses[s.of(first)], held(s, first)[0]))
-    for number in range(first, s.number + 1):
-        tracks.add_pose(problem, s, number, first)
-        tracks.add_rows(problem, s, number, first)
-    tracks.make_smart(problem)
-    with suppress(SolverError):
-        values = minimised(problem, _ITERATIONS)
-        kept[s.of(first) :] = [values.atPose3(pose_key(i)).matrix() for i in range(first, s.number + 1)]
-    M = np.eye(4) if s.anchored else s.poses[-1] @ inverse(kept[-1])
-    return np.asarray(M @ np.concatenate([before, kept]))

@@ -50,17 +50,12 @@ class Path:
         first = self._number.index(number)
         return np.array(self._stamps[first:]), np.array(self._number[first:], np.intp)
 
-    def graph(self, first: int) -> Array:
-        """Poses of the graph before the one with number `first` (N, 4, 4)."""
-        return np.array(self._poses[:first]).reshape(-1, 4, 4)
-
-    def trajectory(self, s: SmootherState, graph: Array | None = None) -> Trajectory:
-        """Poses of all frames; with other poses (N, 4, 4) for those of the graph, if they are given."""
+    def trajectory(self, s: SmootherState) -> Trajectory:
+        """Poses of all frames."""
         if not self._stamps:
             return Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
-        poses = (np.array(self._poses) if graph is None else graph)[self._number] @ np.array(self._relative)
-        if graph is None:
-            poses[-1] = s.last[1]
+        poses = np.array(self._poses)[self._number] @ np.array(self._relative)
+        poses[-1] = s.last[1]
         return Trajectory(np.array(self._stamps), poses)
 
     def recent(self, s: SmootherState, graph: Graph, count: int) -> RecentPoses:

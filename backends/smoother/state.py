@@ -149,8 +149,6 @@ class SmootherState:
     def without_old(self, past: int, lag: int) -> SmootherState:
         """Without what is kept of all but the last `past` poses, of which `lag` are smoothed."""
         gone = len(self.poses) - past
-        if gone <= 0:
-            return self
         return replace(
             self, first=self.first + gone, poses=self.poses[gone:], sights=self.sights[gone:], ties=self.ties[gone:],
             spread=self.spread[gone:], landmarks=self.landmarks.folded(self.first + gone, self.number - lag),

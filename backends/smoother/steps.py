@@ -33,11 +33,6 @@ class Steps(RectifiedMeasurement):
     config: SmootherConfig  # limits
 
     @property
-    def past(self) -> int | None:
-        """Number of poses that are kept; None for all."""
-        return None if self.config.lag is None else self.config.lag + 1 + self.config.past
-
-    @property
     def track(self) -> int:
         """Most poses that a smart factor spans: it ends before its first pose leaves."""
         return self.config.track if self.config.lag is None else min(self.config.track, self.config.lag + 1)
@@ -172,9 +167,9 @@ class Steps(RectifiedMeasurement):
             s, poses=poses, last=last, pair=pair, shared=shared, spread=spread, landmarks=marks,
             known={**s.known, **used} if used else s.known,
         )  # fmt: skip
-        if self.past is None or self.config.lag is None or len(s.poses) < 1.5 * self.past:
-            return s
-        return s.without_old(self.past, self.config.lag)
+        lag = self.config.lag
+        kept = len(s.poses) if lag is None else lag + 1 + self.config.past
+        return s if lag is None or len(s.poses) < 1.5 * kept else s.without_old(kept, lag)
 
     # --- landmarks ---
 

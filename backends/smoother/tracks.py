@@ -164,7 +164,7 @@ class Tracks:
             place = transform(problem.to_graph @ s.poses[s.of(known.pose)], known.position[None])[0]
         problem.values.insert(landmark_key(serial), place)
 
-    def make_smart(self, problem: GraphProblem, careful: bool = True) -> list[tuple[Track, int]]:
+    def make_smart(self, problem: GraphProblem, careful: bool) -> list[tuple[Track, int]]:
         """The smart factors of what grew, and their places in the problem; see `FactorMaker.smart`."""
         made = []
         for track in problem.grown.values():

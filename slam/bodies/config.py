@@ -8,7 +8,7 @@ from slam.bounds import require_not_negative
 from slam.errors import ConfigurationError
 from slam.geometry.rig import MINIMAL_POINTS
 
-MODES = ("detect", "off")
+MODES = ("detect", "procedure1", "off")
 WINDOW = 12  #: cost: frames over which a feature is classified: every track keeps so many measurements
 MIN_POINTS = MINIMAL_POINTS + 1  #: points whose agreement can be tested: three agree with a pose in any case
 MIN_FRAMES = 4  #: measurements from which on a feature is classified
@@ -20,13 +20,15 @@ class ObjectsConfig:
     """Settings of the detector of moving objects.
 
     Attributes:
-        mode: ``"detect"`` finds moving bodies without being told; ``"off"``.
+        mode: ``"detect"`` finds moving bodies without being told; ``"procedure1"`` is the papers' detector with a
+            database of known features (paper B, 3); ``"off"``.
         max_speed: largest speed of a point of a body [m/s]; bounds the search for moving features.
         min_speed: slower bodies are not detected [m/s].
         suspect: χ²(6) of a large group's motion relative to the rest of the scene above which its landmarks are not
             used to measure the camera's pose; the group moves from half as much more on. Both are higher for small
             groups.
         size: what bodies measure across at least, seen in part or whole [m].
+        database: file of the object's features for ``"procedure1"``, see `slam.papers.procedure1`.
     """
 
     mode: str = "detect"
@@ -34,11 +36,14 @@ class ObjectsConfig:
     min_speed: float = 0.01
     suspect: float = 20.0
     size: float = 0.0
+    database: str = ""
 
     def __post_init__(self) -> None:
         require_not_negative(self, {}, "objects")
         if self.mode not in MODES:
             raise ConfigurationError(f"objects: mode must be one of {MODES}, got {self.mode!r}")
+        if self.mode == "procedure1" and not self.database:
+            raise ConfigurationError("objects: mode procedure1 needs a database of the object's features")
         for name in ("max_speed", "suspect"):
             if not getattr(self, name) > 0:
                 raise ConfigurationError(f"objects: {name} must be positive, got {getattr(self, name)}")

@@ -77,7 +77,6 @@ def main() -> None:
 
 
 def _print_version(wanted: bool) -> None:
-    """What ``--version`` prints."""
     if wanted:
         from slam.version import __version__
 
@@ -125,8 +124,7 @@ def run_command(
     calibration: Annotated[_File, option("The rig's errors, from `slam calibrate` or a run.", "FILE")] = None,
     mask: _Mask = None,
     viewer: Annotated[_Text, option("Show it in Rerun, or keep it for Rerun.", "live|FILE.rrd")] = None,
-    draw: Annotated[_File, option("Draw landmarks and objects into the frames.", "DIR|FILE.mp4")] = None,
-    draw_map: Annotated[bool, option("With --draw: the growing map beside each frame.", None, "--draw-map")] = False,
+    draw: Annotated[_File, option("Draw landmarks and objects, and the map that grows.", "DIR|FILE.mp4")] = None,
     live: Annotated[bool, option("Frames at their own rate; late ones are dropped.", None, "--live")] = False,
     picture: _Picture = True,
     overwrite: _Overwrite = False,
@@ -135,7 +133,6 @@ def run_command(
     """Run one sequence through one back end."""
     from slam.commands.display import progress
     from slam.commands.run import finish, frame_count, prepare, run_folder, title
-    from slam.errors import ConfigurationError
     from slam.files import noting_inputs
     from slam.outputs import require_outputs
     from slam.run import drawing
@@ -145,8 +142,6 @@ def run_command(
     from slam.run.warm_up import compile_kernels
     from slam.sequences import is_live, with_mask
 
-    if draw_map and draw is None:
-        raise ConfigurationError("--draw-map draws beside the frames: give --draw FILE.mp4, or a folder, too")
     with noting_inputs() as inputs:
         opened, options = prepare(
             with_mask(sequence, mask), settings or (), frames, backend=backend, frontend=frontend, kind=kind,
@@ -167,7 +162,7 @@ def run_command(
         if viewer is not None:
             watches.append(stack.enter_context(viewing.Viewer(viewer, opened.rig, opened.ground_truth)).show)
         if draw is not None:
-            watches.append(stack.enter_context(drawing.FramePictures(draw, draw_map)).show)
+            watches.append(stack.enter_context(drawing.FramePictures(draw)).show)
         until = threading.Event() if live or is_live(opened) else None
         if until is not None and not quiet:
             what = "are taken until" if is_live(opened) else "come at their own rate, to the last one or until"
@@ -248,7 +243,7 @@ def compare_command(
     overwrite: _Overwrite = False,
     quiet: Annotated[bool, option("No progress, no conclusions.", None, "--quiet", "-q")] = False,
 ) -> None:
-    """Compare back ends on the same recordings: tables, what is certain and what is not, and one HTML report."""
+    """Compare back ends on the same recordings: tables, what can be told from chance, and one HTML report."""
     from slam.commands import compare as command
     from slam.commands.run import command_line
     from slam.compare.plan import Plan
@@ -265,7 +260,6 @@ def compare_command(
 def calibrate_command(
     sequences: Annotated[list[str], argument("Recordings of one rig.", "SEQUENCE")],
     out: Annotated[Path, option("For `slam run --calibration`.", "FILE", "--out", "-o")] = Path("rig_errors.json"),
-    opencv: Annotated[_File, option("The corrected calibration in OpenCV's form.", "FILE.yaml")] = None,
     settings: _Set = None,
     frames: _Frames = None,
     format: _Format = None,
@@ -279,7 +273,7 @@ def calibrate_command(
     from slam.sequences import with_mask
 
     texts = [with_mask(text, mask) for text in sequences]
-    calibrate(texts, out, settings or [], parse_frames(frames), format, quiet, opencv, overwrite)
+    calibrate(texts, out, settings or [], parse_frames(frames), format, quiet, overwrite)
 
 
 @app.command("render", short_help="Write a built-in sequence as a folder.")

@@ -90,6 +90,8 @@ def _span(name: str, stamps: Array) -> str:
 def absolute_errors(estimate: Trajectory, truth: Trajectory) -> PathErrors:
     """ATE of two paths of equal length, row by row (see `associate`), after their alignment without scale.
 
+    Positions alone align them, so errors of the rotation mean little where the camera stood or went straight.
+
     Raises:
         TrajectoryError: the lengths differ, or there is no pose.
     """

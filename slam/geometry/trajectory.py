@@ -81,6 +81,8 @@ class Trajectory:
             axis = plt.figure(layout="constrained").add_subplot()
         across, up = map("xyz".index, plane) if plane else widest(self.positions)
         axis.plot(self.positions[:, across], self.positions[:, up], **options)
+        if "label" in options:
+            axis.legend()
         axis.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[up]} [m]")
         axis.set_aspect("equal", adjustable="datalim")
         return axis

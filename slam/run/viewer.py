@@ -45,7 +45,7 @@ class Viewer:
         try:
             self.rr = import_module("rerun")
         except ImportError as error:
-            raise SlamError("the viewer needs Rerun: pip install rerun-sdk") from error
+            raise SlamError("the viewer needs Rerun: pip install '.[viewer]' in the checkout, or rerun-sdk") from error
         self._target, self._rig, self._truth = target, rig, truth
         self._recording = _open(self.rr, target)
         self._stamps: list[float] = []
@@ -128,7 +128,7 @@ def outputs(target: str | None, option: str) -> list[Output]:
 
 
 def view_run(folder: Path, target: str, overwrite: bool = False) -> None:
-    """Show a finished run from its files: path, objects, and the map at its end; images are not among them.
+    """Show a finished run from its files: path, where bodies were, and the map at its end; it has no images.
 
     Raises SlamError where the folder does not hold a finished run, and as `Viewer` does.
     """
@@ -138,10 +138,8 @@ def view_run(folder: Path, target: str, overwrite: bool = False) -> None:
     with Viewer(target) as viewer:
         for number, (stamp, pose) in enumerate(zip(run.online.stamps, run.online.poses)):
             viewer.show_pose(number, float(stamp), pose)
-            for seen, name, position in run.objects:
-                if abs(seen - stamp) < 1e-6:
-                    mark = viewer.rr.Points3D([position], colors=body_colour(int(name)), radii=0.03)
-                    viewer.log(f"/objects/{name}", mark)
+        for name, places in run.bodies.items():
+            viewer.log(f"/objects/{name}", viewer.rr.Points3D(places, colors=body_colour(int(name)), radii=0.03))
         viewer.show_map(run.positions, run.covariances, run.seen_last)
 
 

@@ -68,6 +68,10 @@ SCENES = {
         (4.0, 60.0), 64.0, "driving",
         (Option("path", "", "file of the path: poses in the form of KITTI (at 10 Hz) or TUM"),), _TOWN, True,
     ),
+    "people": Scene(
+        "a slow drive past parked cars, among cyclists and walkers whose legs swing", traffic.people,
+        (4.0, 60.0), 64.0, "driving", defaults=_DRIVING,
+    ),
     "startup": Scene(
         "a board of features with known positions, the camera at [3, -70, 2.7] cm (paper B, section 4.2)",
         indoors.startup, (0.2, 3.0), 1000.0,

@@ -1,4 +1,4 @@
-"""A drive through two streets of a town with moving cars, at the scale and rate of KITTI."""
+"""A drive through two streets of a town, at the scale and rate of KITTI: with moving cars, or slowly among people."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 
 from slam.geometry.se3 import Array
 from slam.worlds.drives import EYE, PACE, STEP, Road
-from slam.worlds.geometry import Parts, Rectangle
+from slam.worlds.geometry import Parts, Rectangle, crate
 from slam.worlds.paths import camera_poses, clock, placed, smooth_step, sway
 from slam.worlds.streets import Streets, car
+from slam.worlds.surfaces import Material
 
 TURN_AT, TURN_LENGTH = 104.0, 30.0  #: where the turn to the left begins and how long it is [m along the path]
 _LENGTH = 250.0  #: of the streets along the way [m]
@@ -75,3 +76,45 @@ def _drive(t: Array, number: int) -> Array:
         across, turn = _LANE, np.pi
     place, heading = path(s, across)
     return placed((*place.T, 0), (heading + turn, 0, 0))
+
+
+PARTS = 3  #: bodies a person is made of: the trunk (with the bicycle), and two legs
+HIP = 0.9  #: height of the hips [m]
+_STRIDE = 0.45  # how far a leg swings to both sides [rad]
+
+#: Who moves how: whether on a bicycle, where at the start and to which side of the way [m], how fast along and across
+#: [m/s], and steps (turns of the pedals) a second [Hz].
+PEOPLE = (
+    (True, 11.0, -1.6, 4.2, 0.0, 1.1),
+    (False, 16.0, -2.5, 1.4, 0.0, 0.9),
+    (True, 62.0, 2.6, -4.8, 0.0, 1.2),
+    (False, 38.0, 4.5, 0.0, -1.3, 0.8),
+    (False, 55.0, 3.6, -1.2, 0.0, 0.9),
+)
+
+
+def people(values: Mapping[str, Any]) -> Parts:
+    """A slow drive past parked cars, among cyclists and walkers whose legs swing about the hips."""
+    stamps, t = clock(values, 14.0)
+    layout = values["layout"]
+    rng = np.random.default_rng([layout, 47])
+    poses = driver(5.0 * t + 0.2 * sway(t, rng, 0.03, 0.15), stamps, rng)
+    rectangles, objects = surroundings(layout), []
+    for number, (cycles, ahead, across, along, aside, pace) in enumerate(PEOPLE):
+        rectangles += _person(cycles, 9000 + 50 * layout + 10 * number, PARTS * number + 1)
+        place, heading = path(ahead + along * t, across + aside * t)
+        T = placed((*place.T, 0), (heading + np.arctan2(aside, along), 0, 0))
+        swing = _STRIDE * np.sin(2 * np.pi * pace * t + number)
+        objects += [T, *(T @ placed((0 * t, 0, HIP), (0, 0, side * swing)) for side in (1.0, -1.0))]
+    return Parts(stamps, poses, rectangles, np.array(objects))
+
+
+def _person(cycles: bool, seed: int, body: int) -> list[Rectangle]:
+    """Trunk and head (a cyclist's with the bicycle) as `body`, and the legs as the next two; boxes of cloth."""
+    boxes = [((0.46, 0.28, 0.62), (-0.23, -0.14, HIP), 0, 0), ((0.2, 0.22, 0.26), (-0.1, -0.11, HIP + 0.62), 1, 0)]
+    boxes += [((0.08, 1.7, 0.45), (-0.04, -0.85, 0.1), 2, 0)] if cycles else []
+    boxes += [((0.16, 0.18, 0.8), (x, -0.09, -0.85), 2 + leg, leg) for leg, x in ((1, -0.2), (2, 0.04))]
+    out = []
+    for size, corner, number, part in boxes:
+        out += crate(size, Material(0, 0, "carton", 20 * (seed + number), 60, (0.02, 0.08)), corner, body + part)
+    return out

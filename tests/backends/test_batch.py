@@ -10,7 +10,6 @@ import pytest
 
 import slam
 from backends.batch import BatchBackend
-from backends.smoother import SmootherBackend
 from backends.smoother.graph import SolverError
 from experiments.simulated_recording import true_recording
 from slam.data import StereoFeatures
@@ -40,26 +39,6 @@ def test_without_noise_smoother_and_batch_are_the_truth(world):
         off = np.abs(se3.log(se3.inverse(truth) @ poses))
         # What is left is the pull of the motion prior against measurements of 0.01 px.
         assert off.max() < 1e-6, f"{name}: off by {off.max()}"
-
-
-@pytest.mark.parametrize("error", [RuntimeError("Indeterminant linear system\ndetected"), KeyError("x1")], ids=str)
-def test_covariances_that_gtsam_cannot_give_are_the_smoothers(monkeypatch, caplog, error):
-    class Broken:
-        def __init__(self, *_):
-            raise error
-
-    data = drive()
-    backend, smoother = BatchBackend(RIG, MODELS), SmootherBackend(RIG, MODELS, lag=None)
-    run(backend, data)
-    run(smoother, data)
-    monkeypatch.setattr(gtsam, "Marginals", Broken)
-    estimate, rough = backend.estimate(), smoother.estimate()
-    assert [record.getMessage()[:40] for record in caplog.records] == ["batch: covariances are the smoother's, g"]
-    np.testing.assert_allclose(estimate.covariance, rough.covariance, rtol=1e-9)
-    np.testing.assert_allclose(estimate.covariances, rough.covariances, rtol=1e-9)
-    off = np.abs(estimate.positions - rough.positions).max(axis=1)
-    deviations = np.sqrt(np.trace(rough.covariances, axis1=1, axis2=2))
-    assert 0 < np.median(off / deviations) < 1, "positions are the solved ones"
 
 
 def test_a_problem_that_cannot_be_solved_is_one_line(monkeypatch):

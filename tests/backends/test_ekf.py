@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from threadpoolctl import threadpool_limits
 
 from backends.ekf import EkfBackend
 from backends.ekf.landmarks import COORDINATES, gauge_jacobian
@@ -34,20 +33,11 @@ def drive() -> Scene:
     return turning_drive()
 
 
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        (
-            {"iteration": 3},
-            r"unknown option 'iteration' \(did you mean 'iterations'\?\); known: papers, measurement, iterations",
-        ),
-        ({"landmarks": "polar"}, "landmarks"),
-        ({"iterations": 0}, "iterations"),
-    ],
-)
-def test_wrong_options_are_refused(options, message):
-    with pytest.raises(ConfigurationError, match=message):
-        EkfBackend(RIG, **options)
+def test_wrong_options_are_refused():
+    with pytest.raises(ConfigurationError, match=r"unknown option 'iteration' \(did you mean 'iterations'\?\)"):
+        EkfBackend(RIG, iteration=3)
+    with pytest.raises(ConfigurationError, match="landmarks must be one of"):
+        EkfBackend(RIG, landmarks="polar")
 
 
 # --- accuracy ---
@@ -194,16 +184,6 @@ def test_what_nothing_measures_stays_unknown(drive, options):
         learnt.append(np.diag(information))
     assert (learnt[0] < 1.01).all()  # less than 1 where the model's impulses have loosened it
     assert learnt[1].max() > 2.0
-
-
-def test_the_result_does_not_depend_on_blas_threads(drive):
-    results = []
-    for threads in (1, 2):
-        with threadpool_limits(threads, user_api="blas"):
-            backend, _ = halfway(drive, 12)
-            results.append(backend.estimate())
-    np.testing.assert_array_equal(results[0].T_world_left, results[1].T_world_left)
-    np.testing.assert_array_equal(results[0].covariances, results[1].covariances)
 
 
 def test_the_last_poses_are_known_together():

@@ -6,23 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
-from scipy.stats import chi2
 
-from backends.ekf.backend import EkfBackend
+from backends.ekf.backend import EkfConfig
 from backends.ekf.camera import moved
-from backends.ekf.covariance import CAMERA, Covariance
-from backends.ekf.innovation import UnsolvableError, Update, Whitened
+from backends.ekf.covariance import CAMERA, HEAD, Covariance
+from backends.ekf.innovation import Update, Whitened
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth
 from backends.ekf.motion import EulerCamera
-from backends.ekf.recovery import agreement
 from backends.ekf.solve import gate, solve
 from backends.ekf.state import FilterState
-from slam.data import Observations
 from slam.geometry import se3
 from slam.geometry.se3 import body_rate_matrix, rotation
-from slam.models import EstimatorModels, MotionModel, SlideModel
-from slam.window.stereo import RectifiedMeasurement, RectifiedStereo, relative_covariance
+from slam.models import EstimatorModels, MotionModel
+from slam.window.stereo import RectifiedMeasurement
 from tests.backends.ekf_runs import dense
 from tests.backends.scenes import RIG
 from tests.slam.numeric import assert_equal_to_rounding, jacobian, positive
@@ -85,30 +83,9 @@ def test_a_step_in_pieces_has_the_noise_of_a_whole_one():
 
 
 def covariance_of(P: np.ndarray) -> Covariance:
-    """Of a camera and landmarks with a joint covariance."""
-    return Covariance(P.copy(), np.zeros((len(P), 0)), np.zeros((0, 3, 3)))
-
-
-@pytest.mark.parametrize("phi", ATTITUDES)
-def test_measurement_jacobians(phi):
-    """By the papers' [r, φ] and by the landmark; and what follows from H: H P, and S."""
-    rng = np.random.default_rng(2)
-    camera = EulerCamera(np.concatenate([rng.standard_normal(3), phi, np.zeros(6)]), se3.so3_exp(np.ones(3)), False)
-    h, P = rng.uniform((-1, -1, 4), (1, 1, 10), (5, 3)), positive(27, rng)
-    marks = FilterLandmarks.at(Euclidean(), np.arange(5), np.zeros((5, 3, 4)), se3.transform(camera.pose, h), 0)
-    s = replace(FilterState.first(camera, P[:12, :12]), landmarks=marks, covariance=covariance_of(P))
-    update = update_of(s, np.zeros((5, 3)), Euclidean(), 1)
-    np.testing.assert_allclose(update.at().z, RectifiedStereo.of(RIG).project(h)[0], atol=1e-9)
-
-    def predicted(x):
-        return update.at(camera.moved(x[:12]), x[12:]).z
-
-    H = jacobian(predicted, np.zeros(27))
-    found, expected = update.at().innovation(), H @ P
-    np.testing.assert_allclose(found.HP, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
-    np.testing.assert_allclose(
-        found.S, expected @ H.T + 0.25 * np.eye(15), rtol=1e-5, atol=1e-6 * np.abs(found.S).max()
-    )
+    """Of a camera and landmarks with a joint covariance, and of no poses before."""
+    P = np.insert(np.insert(P, [CAMERA] * (HEAD - CAMERA), 0.0, axis=0), [CAMERA] * (HEAD - CAMERA), 0.0, axis=1)
+    return Covariance(P, np.zeros((len(P), 0)), np.zeros((0, 3, 3)))
 
 
 # --- the landmarks' coordinates ---
@@ -131,15 +108,16 @@ def test_coordinates_there_and_back(coordinates):
 
 
 def grown(rng: np.random.Generator) -> tuple[Covariance, np.ndarray]:
-    """Four landmarks that left the state, seven in it and three that are only known; and the same as one matrix."""
+    """A camera whose last poses were known for certain, four landmarks that left the state, seven in it and three that
+    are only known; and the same as one matrix."""
     camera = positive(CAMERA, rng)
     J, noise = rng.standard_normal((11, 3, 6)), np.array([positive(3, rng) for _ in range(11)])
-    F = np.concatenate([np.eye(CAMERA), np.pad(J.reshape(-1, 6), ((0, 0), (0, 6)))])
+    F = np.concatenate([np.eye(HEAD, CAMERA), np.pad(J.reshape(-1, 6), ((0, 0), (0, 6)))])
     P = F @ camera @ F.T
     known = np.array([positive(3, rng) for _ in range(3)])
     P = np.pad(P, (0, 9))
     for i, block in enumerate([*noise, *known]):
-        rows = slice(12 + 3 * i, 15 + 3 * i)
+        rows = slice(HEAD + 3 * i, HEAD + 3 * i + 3)
         P[rows, rows] += block
     covariance = replace(Covariance.of_camera(camera).appended(J, noise, np.zeros((11, 3, 0))), known=known)
     return covariance.rearranged(np.arange(4), np.arange(4, 11), np.arange(11, 14)), P
@@ -147,15 +125,11 @@ def grown(rng: np.random.Generator) -> tuple[Covariance, np.ndarray]:
 
 def whole(covariance: Covariance) -> np.ndarray:
     """All of it as one matrix."""
-    n = len(covariance.P)
-    P = np.pad(covariance.P, (0, 3 * len(covariance.known)))
-    for i, block in enumerate(covariance.known):
-        P[n + 3 * i : n + 3 * i + 3, n + 3 * i : n + 3 * i + 3] = block
-    return P
+    return block_diag(covariance.P, *covariance.known)
 
 
 def numbers(rows) -> np.ndarray:
-    return np.concatenate([np.arange(CAMERA), *[CAMERA + 3 * r + np.arange(3) for r in rows]])
+    return np.concatenate([np.arange(HEAD), *[HEAD + 3 * r + np.arange(3) for r in rows]])
 
 
 def test_landmarks_move_between_the_parts():
@@ -163,7 +137,7 @@ def test_landmarks_move_between_the_parts():
     assert_equal_to_rounding(whole(covariance), P)
     blocks, cross = covariance.marginals(np.arange(14))
     for i in range(14):
-        rows = slice(12 + 3 * i, 15 + 3 * i)
+        rows = slice(HEAD + 3 * i, HEAD + 3 * i + 3)
         assert_equal_to_rounding(blocks[i], P[rows, rows])
         assert_equal_to_rounding(cross[i], P[rows, :6])
     parts = [1, 9, 10], [0, 2, 5, 8, 12], [11, 13]
@@ -171,32 +145,35 @@ def test_landmarks_move_between_the_parts():
     assert_equal_to_rounding(whole(covariance.rearranged(*map(np.array, parts))), P[np.ix_(g, g)])
 
 
+def advanced(covariance: Covariance, P: np.ndarray, rng) -> tuple[Covariance, np.ndarray]:
+    """After five motions of the camera, by which four of its poses are kept."""
+    for _ in range(5):
+        pose, J, noise = rng.standard_normal((6, 6)), rng.standard_normal((12, 12)), positive(12, rng)
+        F = np.eye(len(P))
+        F[:HEAD, :HEAD] = np.eye(HEAD, k=-6)
+        F[:12, :12], F[12:18, :6], F[12:18, 6:12] = J, pose, 0.0
+        covariance, P = covariance.advanced(pose, J, noise), F @ P @ F.T
+        P[:12, :12] += noise
+    return covariance, P
+
+
 def test_the_last_poses_are_kept():
-    """Of three poses the last two, behind the camera; landmarks that had left come back."""
-    covariance, P = grown(np.random.default_rng(6))
-    M, poses = np.eye(len(P)), [np.random.default_rng(k).standard_normal((6, 6)) for k in range(3)]
-    for J in poses:
-        covariance = covariance.advanced(J, 2, np.eye(12), np.zeros((12, 12)))
-    kept = np.zeros((12, len(P)))
-    kept[:6, :6], kept[6:, :6] = poses[2], poses[1]
-    M = np.concatenate([M[:12], kept, M[12:]])
-    assert_equal_to_rounding(whole(covariance), M @ P @ M.T)
-    g = numbers([4, 5, 6, 7, 8, 9, 10, 1, 12])
+    """Behind the camera; landmarks that had left come back."""
+    rng = np.random.default_rng(6)
+    covariance, P = advanced(*grown(rng), rng)
+    assert_equal_to_rounding(whole(covariance), P)
+    g = numbers([0, 3, 4, 5, 6, 7, 8, 9, 10, 1, 12, 11])
     back = covariance.rearranged(np.array([0, 3]), np.array([4, 5, 6, 7, 8, 9, 10, 1, 12]), np.array([11]))
-    assert_equal_to_rounding(dense(back), P[np.ix_(g, g)])
-    found = np.delete(back.P[12:24], np.s_[12 : 24 + 6], axis=1)
-    assert_equal_to_rounding(found, np.concatenate([poses[2], poses[1]]) @ P[:6, g])
-    assert_equal_to_rounding(back.joint_poses(np.eye(6), 3)[-6:, -6:], P[:6, :6])
+    assert_equal_to_rounding(whole(back), P[np.ix_(g, g)])
+    order = np.r_[18:24, 12:18, :6]
+    assert_equal_to_rounding(back.joint_poses(np.eye(6), 3), P[np.ix_(order, order)])
 
 
 def test_a_correction_and_its_transport():
     """Landmarks that have left and last poses keep their own covariance; all else changes as written."""
     rng = np.random.default_rng(10)
-    covariance, P = grown(rng)
-    past = rng.standard_normal((6, 6))
-    M = np.insert(np.eye(len(P)), [12] * 6, np.pad(past, ((0, 0), (0, len(P) - 6))), axis=0)
-    covariance, P = covariance.advanced(past, 2, np.eye(12), np.zeros((12, 12))), M @ P @ M.T
-    b, m, kept = 12 + 6 + 12, 12 + 6 + 33, np.r_[12:30]
+    covariance, P = advanced(*grown(rng), rng)
+    b, m, kept = HEAD + 12, HEAD + 33, np.r_[12 : HEAD + 12]
     V = 0.1 * rng.standard_normal((m, 5))
     J, K = np.eye(CAMERA), rng.standard_normal((7, 3, 6))
     J[:3, 3:6] = rng.standard_normal((3, 3))
@@ -219,7 +196,9 @@ def state_of(landmarks: int, coordinates) -> tuple[FilterState, np.ndarray, np.r
     """A camera that moves among landmarks, and their true places in its coordinates."""
     rng = np.random.default_rng(5)
     h = rng.uniform((-2, -1.5, 4), (2, 1.5, 9), (landmarks, 3))
-    s = replace(FilterState.first(*EulerCamera.first(MODELS, False)), stamp=0.0, frame=0)
+    camera, P = EulerCamera.first(MODELS, False)
+    camera = replace(camera, x=np.concatenate([rng.standard_normal(3), ATTITUDES[1], np.zeros(6)]))
+    s = replace(FilterState.first(camera, P), stamp=0.0, frame=0)
     s = replace(s, covariance=s.covariance.camera_moved(np.eye(CAMERA), 1e-4 * positive(CAMERA, rng)))
     return s.placed(coordinates, np.arange(landmarks), h, RIG.triangulation_covariance(h, 0.5)), h, rng
 
@@ -363,17 +342,22 @@ def far_in_depth(seed: int) -> tuple[FilterState, Update, np.ndarray]:
     P = np.diag(np.concatenate([sigma**2, np.full(6, 0.01), off.ravel() ** 2]))
     marks = FilterLandmarks.at(InverseDepth(), np.arange(n), anchors, known, 0)
     s = replace(s, landmarks=marks, covariance=covariance_of(P))
-    return s, update_of(s, z, InverseDepth(), 5, 1 - 1e-15), truth
+    return s, update_of(s, z, InverseDepth(), EkfConfig().iterations, 1 - 1e-15), truth
 
 
 def test_depths_that_move_do_not_bend_the_pose():
-    """An error of the pose moves landmarks from where they are by now, also where the covariance is transported."""
+    """An error of the pose moves landmarks from where they are by now, also where the covariance is transported.
+
+    Every update comes to its end: after five linearisations one of a hundred was still .17 m off.
+    """
     off = []
-    for seed in range(20):
+    for seed in range(100):
         s, update, truth = far_in_depth(seed)
         after = s.corrected(solve(replace(gate(update), limits=np.full(15, 1e9))))
         off.append(np.linalg.norm(after.pose[:3, 3] - truth[:3, 3]))
-    assert np.sqrt(np.mean(np.square(off))) < 0.035  # .028, as least squares; .047 with the lever of the prior
+    assert (
+        max(off) < 0.1 and np.sqrt(np.mean(np.square(off))) < 0.035
+    )  # .028, as least squares; .047 with the lever of the prior
 
 
 def test_a_coordinate_at_its_limit_has_changed_by_so_much():
@@ -387,19 +371,6 @@ def test_a_coordinate_at_its_limit_has_changed_by_so_much():
     np.testing.assert_array_equal(at.change[12:], made)
     expected = (update.z - at.z + (at.own @ made.reshape(-1, 3, 1))[:, :, 0]).reshape(-1)
     np.testing.assert_allclose(at.innovation().nu, expected, atol=1e-9)
-
-
-def test_a_prior_that_cannot_be_tried_does_not_end_the_others(monkeypatch):
-    """Most contradict the prediction, and the wider priors fail numerically: what agrees with it still counts."""
-    _, update = far_off(5)
-
-    def failing(tried, T=None):
-        if T is not None:
-            raise UnsolvableError("not positive definite")
-        return replace(gate(tried), used=np.arange(12) < 5)
-
-    monkeypatch.setattr("backends.ekf.recovery.gate", failing)
-    assert agreement(replace(update, guess=np.eye(4)), lambda: None).used.sum() >= 5
 
 
 def test_what_is_taken_out_was_never_there():
@@ -434,7 +405,7 @@ def test_no_linearisation_measures_a_displacement_of_the_world(coordinates, tran
     for camera in (None, there):
         change = 0.02 * rng.standard_normal((12, 3)) * s.landmarks.c
         at = update.at(camera, change.reshape(-1))
-        H = at.innovation().HP
+        H = np.delete(at.innovation().HP, np.s_[CAMERA:HEAD], axis=1)
         U = np.zeros((48, 6))
         U[:6] = np.linalg.inv((s.camera if transports else at.camera).world())
         marks = s.landmarks if transports else s.landmarks.moved(coordinates, slice(None), change)
@@ -468,37 +439,3 @@ def test_a_landmark_slides_across_its_line_of_sight_with_the_angle_of_view(coord
     assert replace(found, camera=s.camera).slid(coordinates, rows, density).landmarks.turned.tolist() == (
         found.landmarks.turned.tolist()
     )
-
-
-def nees_among_sliding_features(density: float, seed: int) -> float:
-    """Of the pose relative to that four frames before, on a drive past points whose features slide by 3 px / √rad."""
-    rng = np.random.default_rng(seed)
-    models = EstimatorModels(MotionModel(1.0, 0.3, wheels=True), 0.28, SlideModel(density), initial_velocity_sigma=15.0)
-    points = rng.uniform((-10, -2, 4), (10, 3, 30), (120, 3))
-    backend, slides, last, ids = EkfBackend(RIG, models), np.zeros((120, 2)), points, np.zeros(0, np.int64)
-    for k in range(12):
-        sight, before = points - (0, 0, 0.8 * k), ids
-        cosine = (sight * last).sum(1) / np.linalg.norm(sight, axis=1) / np.linalg.norm(last, axis=1)
-        slides += 3.0 * np.sqrt(np.arccos(np.clip(cosine, -1, 1)))[:, None] * rng.standard_normal(slides.shape)
-        z, last = RIG.project_stereo(sight)[0] + 0.28 * rng.standard_normal((120, 3)), sight
-        z += slides[:, [0, 1, 0]]
-        near = (sight[:, 2] > 3) & (sight[:, 2] < 20)
-        ids = np.flatnonzero(near & (z > 0).all(1) & (z < (RIG.width, RIG.height, RIG.width)).all(1))
-        seen, old = Observations(ids, z[ids, :2], z[ids][:, [2, 1]]), np.isin(ids, before)
-        backend.predict(0.1 * k)
-        backend.update(seen.select(old))
-        backend.remove(np.setdiff1d(before, ids))
-        backend.add(seen.select(~old))
-    recent = backend.recent(5)
-    ends = np.r_[0:6, 24:30]
-    P = relative_covariance(recent.covariance[np.ix_(ends, ends)], recent.poses[0], recent.poses[-1])
-    true = np.eye(4)
-    true[2, 3] = 3.2
-    error = se3.log(se3.inverse(recent.poses[-1]) @ recent.poses[0] @ true)
-    return float(error @ np.linalg.solve(P, error))
-
-
-def test_a_filter_that_models_the_slide_is_as_sure_as_it_may_be():
-    modelled, left_out = (np.mean([nees_among_sliding_features(q, seed) for seed in range(10)]) for q in (3.0, 0.0))
-    least, most = chi2.ppf([0.001, 0.999], 60) / 10
-    assert least < modelled < most < left_out, (modelled, left_out)

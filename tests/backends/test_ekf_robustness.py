@@ -48,20 +48,6 @@ def test_the_angles_singularity_is_harmless(rate):
     assert sum(len(r.rejected) for r in reports) < 10
 
 
-def test_a_turn_through_the_singularity_in_one_step():
-    data = scene(path(30, 0.5, STILL, 4 * ROLL), points=300)  # 115 degrees a frame
-    backend = EkfBackend(RIG, replace(MODELS, initial_angular_velocity_sigma=3.0))
-    known: set[int] = set()
-    for stamp, guess, seen in data:
-        backend.predict(stamp)
-        old = np.array([i in known for i in seen.ids.tolist()], bool)
-        backend.update(seen.select(old), guess)
-        backend.add(seen.select(~old))
-        known.update(seen.ids.tolist())
-        assert np.linalg.eigvalsh(backend.estimate(False).covariance).min() > 0
-    assert errors(backend, data.poses)[0] < 0.02
-
-
 @BOTH
 def test_a_shock_beyond_the_motion_model_is_followed(make):
     before = path(15, 0.1, 0.3 * FORWARD, STILL)
@@ -112,26 +98,6 @@ def test_known_landmarks_are_found_again_after_a_blind_stretch(make, count):
     assert nees(backend, poses[-1]) < chi2.ppf(0.9999, 6)
 
 
-@BOTH
-def test_a_pair_that_is_not_in_step_moves_nothing(make):
-    """The first right images were taken at other times, at 10 m/s: their landmarks contradict all that follows."""
-    poses, rng = path(10, 0.1, 6.7 * FORWARD, STILL), np.random.default_rng(1)
-    models = replace(models_for("driving"), pixel_sigma=0.5, slide=SlideModel())
-    points = cloud(poses, 150, rng, 10.0, 50.0)
-    backend, known = make(RIG, models), set()
-    late = se3.pose(np.eye(3), [0, 0, 0.5])
-    for k, T in enumerate(poses):
-        seen = observe(T, points, 0.5, rng, 150)
-        if k < 2:
-            local = se3.transform(se3.inverse(T @ late if k else T @ se3.inverse(late)), points[seen.ids])
-            seen = Observations(seen.ids, seen.uv_left, RIG.project(local)[1])
-        if k in (1, 2):  # as long as there is nothing else to see
-            seen = seen.select(np.array([i in known for i in seen.ids.tolist()], bool))
-        step(backend, 0.1 * k, seen, known)
-        off = se3.log(se3.inverse(T) @ backend.trajectory().poses[-1])
-        assert np.linalg.norm(off[:5]) < 0.3 and abs(off[5]) < 0.7 * T[2, 3] + 0.1
-
-
 @pytest.mark.parametrize("name, seed", [("ekf", 207), ("iekf", 212), ("ekf", 14), ("ekf", 315), ("iekf", 318)])
 def test_no_landmark_loses_its_variance(name, seed):
     """Calls with gaps of years and landmarks of little parallax: large numbers cancel, or a step has no meaning."""
@@ -142,7 +108,7 @@ def test_no_landmark_loses_its_variance(name, seed):
 
 
 @BOTH
-@pytest.mark.parametrize("share", [0.1, 0.4])
+@pytest.mark.parametrize("share", [0.1, 0.5])
 def test_wrong_matches_are_found(make, drive, share):
     rng = np.random.default_rng(3)
     backend, known, missed, false, wrong = make(RIG, MODELS), set(), 0, 0, 0
@@ -190,28 +156,7 @@ def test_a_broken_covariance_is_a_status_with_a_reason(drive, entry, where):
     np.testing.assert_array_equal(backend.state.camera, before.camera)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("landmarks", ["inverse_depth", "euclidean"])
-def test_far_points_stay_before_the_camera(landmarks):
-    """Points at 60 to 400 m, whose disparity is all noise: no position and no covariance loses its meaning.
-
-    Nor do they hold up the first steps: the inverse depth of some wants to be negative.
-    """
-    rng = np.random.default_rng(5)
-    poses = path(25, 0.1, np.array([0, 0, 2.0]), 0.02 * YAW)
-    points = np.concatenate([cloud(poses, 60, rng, 4.0, 15.0), cloud(poses, 120, rng, 60.0, 400.0)])
-    backend, known = EkfBackend(RIG, replace(MODELS, pixel_sigma=0.7), landmarks=landmarks), set()
-    for k, T in enumerate(poses):
-        step(backend, 0.1 * k, observe(T, points, 0.7, rng, 180), known)
-        found = backend.estimate()
-        depth = ((found.positions - T[:3, 3]) @ T[:3, :3])[found.ids >= 60, 2]
-        assert landmarks == "euclidean" or (depth > 0).all()
-        assert np.linalg.eigvalsh(found.covariances).min() > 0
-        np.testing.assert_array_equal(found.covariances, np.swapaxes(found.covariances, 1, 2))
-    assert landmarks == "euclidean" or errors(backend, poses)[1] < 0.05
-
-
-@pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])
+@BOTH
 @pytest.mark.parametrize("degrees", [80, 88, 180])
 def test_a_roll_in_one_step(make, degrees):
     """Beyond what the motion model expects, to where Euler angles are singular: all landmarks count in the end."""

@@ -138,19 +138,6 @@ def test_landmarks_placed_before_the_camera_move_with_its_pose(name):
     assert np.linalg.norm(last[:3, 3] - scene.poses[-1][:3, 3]) < 0.03
 
 
-def test_placing_what_stereo_says_is_adding():
-    """`place` with the stereo pair's own covariance gives the filter the very belief that `add` does."""
-    scene = Scene(frames=1)
-    seen = scene.seen[0]
-    local = RIG.triangulate(seen.uv_left, seen.uv_right)
-    one, other = (backends.create("ekf", RIG, models=models()) for _ in range(2))
-    one.predict(0.0), other.predict(0.0)
-    one.add(seen)
-    other.place(seen.ids, local, RIG.triangulation_covariance(local, SIGMA))
-    np.testing.assert_array_equal(one.estimate().covariances, other.estimate().covariances)
-    np.testing.assert_array_equal(one.estimate().positions, other.estimate().positions)
-
-
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     ("change", "words"),

@@ -12,10 +12,7 @@ from backends.smoother import SmootherBackend
 from slam.data import UpdateStatus
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
-from slam.window import recovery
-from slam.window.pose_only import PoseProblem
-from slam.window.stereo import RectifiedStereo
-from tests.backends.scenes import RIG, begun_in_the_dark, cloud, observe, path, run, scene, step, steps_off
+from tests.backends.scenes import RIG, begun_in_the_dark, observe, path, run, scene, step, steps_off
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
 DT = 0.1
@@ -132,17 +129,3 @@ def test_a_map_that_begins_where_nobody_knows_how_the_camera_is_turned(lag, seed
         found.append(backend.estimate(landmarks=False).T_world_left)
         begun.add(backend.state.begun)
     assert steps_off(found, poses) < 0.1 and rejected < 60 and len(begun) <= 2, begun
-
-
-def test_a_few_wrong_matches_that_agree_by_chance_move_nothing():
-    rng, stereo = np.random.default_rng(0), RectifiedStereo.of(RIG)
-    points = cloud(np.eye(4)[None], 60, rng)
-    z, _ = stereo.project(points)
-    wrong = rng.permutation(60)[: 60 - 8]
-    z[wrong, :2] = rng.uniform(0, 480, (len(wrong), 2))
-    z[wrong, 2] = z[wrong, 0] - rng.uniform(5, 60, len(wrong))
-    noise = np.tile(4.0 * np.eye(3), (60, 1, 1))
-    problem = PoseProblem(stereo, points, z, noise, np.eye(4), 100.0 * np.eye(6), 0.999)
-    assert recovery.agreement(problem, np.eye(4), lambda: None, 0, False).used.sum() >= 8  # they are no chance
-    z[:, :2] += rng.uniform(-150, 150, (60, 2))
-    assert not recovery.agreement(problem, np.eye(4), lambda: None, 0, False).used.any()

@@ -50,7 +50,7 @@ ANSWERS = [
 @pytest.mark.parametrize("method,change,words", ANSWERS)
 def test_a_back_end_of_nonsense_is_named(method, change, words):
     system = StereoSlam(RIG, "surf", Changed(method, change))
-    with pytest.raises(SlamError, match=f"Changed.{words}"):
+    with pytest.raises(SlamError, match=f"^frame [01]: Changed.{words}"):
         for stamp in (0.0, 0.1):  # positions are asked for once there are landmarks
             system.process(LEFT, RIGHT, stamp)
 
@@ -127,6 +127,15 @@ def test_a_failing_back_end_is_named_and_the_cause_is_kept(method, error):
     with pytest.raises(PartError, match=rf"^frame 0: Failing.fails failed: {type(error).__name__}") as raised:
         system.process(LEFT, RIGHT, 0.0)
     assert raised.value.__cause__ is error
+
+
+def test_the_line_named_is_of_the_back_end_and_not_of_the_library_that_it_calls():
+    class Singular(EkfBackend):
+        def predict(self, stamp):
+            return np.linalg.inv(np.zeros((2, 2)))
+
+    with pytest.raises(PartError, match=r"LinAlgError: Singular matrix \(test_answers\.py, line \d+\)"):
+        StereoSlam(RIG, "surf", Singular(RIG, models=EstimatorModels())).process(LEFT, RIGHT, 0.0)
 
 
 def test_a_front_end_that_stops_does_not_end_the_frames():

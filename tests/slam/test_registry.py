@@ -78,6 +78,9 @@ def test_modules_and_classes_of_elsewhere_that_fail_get_one_line(tmp_path, monke
     monkeypatch.setattr(sys, "path", list(sys.path))
     with pytest.raises(UnknownNameError, match=r"NameError: .*undefined.* \(module_that_raises.py, line 2\)"):
         registry.create("backends", "module_that_raises:Mine", "rig")
+    (tmp_path / "module_that_lacks.py").write_text("\nimport nosuch\n")
+    with pytest.raises(UnknownNameError, match=r"No module named 'nosuch' \(module_that_lacks.py, line 2\)"):
+        registry.create("backends", "module_that_lacks:Mine", "rig")
     cases = {
         "Nothing": ({}, "is none: it lacks predict, update"),
         "Raises": ({}, r"cannot be created: RuntimeError: no way \(foreign_classes.py, line 5\)"),

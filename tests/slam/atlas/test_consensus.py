@@ -128,7 +128,8 @@ def test_a_loop_that_contradicts_another_is_closed_where_all_that_was_seen_agree
         return disagreement(graph, glance(64, 0.0)) - 26.0
 
     off = brentq(between, 0.3, 5.0)
-    first = replace(atlas_of(65), loops=(glance(62, off),))
+    whole = atlas_of(65)
+    first = replace(whole, loops=(glance(62, off),))
     alone = close(first, glance(64, 0.0), CommonError(), False)
     assert alone.refused == ((4, 64),)
     together = close(first.with_inactive_loop(glance(63, 0.6 * off)), glance(64, 0.0), CommonError(), False)

@@ -117,6 +117,8 @@ def test_off_detects_nothing():
 def test_settings_are_checked():
     with pytest.raises(ConfigurationError, match="mode"):
         ObjectsConfig(mode="neural")
+    with pytest.raises(ConfigurationError, match="database"):
+        ObjectsConfig(mode="procedure1")
     for name, value in (("max_speed", 0.0), ("suspect", 0.0)):
         with pytest.raises(ConfigurationError, match=name):
             ObjectsConfig(**{name: value})

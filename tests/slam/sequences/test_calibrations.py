@@ -14,7 +14,8 @@ import pytest
 import slam
 from slam.errors import CalibrationError, ConfigurationError, SlamError
 from slam.sequences import open_sequence
-from slam.sequences.rigs import read_rig, write_opencv
+from slam.sequences.rigs import read_rig
+from tests.recordings import write_opencv
 
 SIZE = (64, 48)
 K = np.array([[50.0, 0, 31.5], [0, 51.0, 23.5], [0, 0, 1]])
@@ -157,6 +158,13 @@ def load(tmp_path: Path, name: str, encoding: str = "utf-8", **options) -> slam.
     known = {"size": SIZE, **known, **options}
     known.pop("focal", None)
     return slam.load_rig(*(tmp_path / file for file in files), **known)
+
+
+def test_a_lens_of_one_camera_alone_is_refused(tmp_path: Path) -> None:
+    both = {"K1": M, "D1": [-0.3, 0.1, 0, 0], "K2": M, "R": EYE, "T": [-0.2, 0, 0]}
+    (tmp_path / "a.json").write_text(json.dumps(both))
+    with pytest.raises(CalibrationError, match="D2 is missing"):
+        slam.load_rig(tmp_path / "a.json", size=SIZE)
 
 
 @pytest.mark.parametrize("name", FORMS)

@@ -12,7 +12,7 @@ import pytest
 import slam
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.sequences import camera, is_live
-from slam.sequences.rigs import write_opencv
+from tests.recordings import write_opencv
 
 WIDTH, HEIGHT = 160, 120
 

@@ -54,6 +54,19 @@ def test_features_lie_where_the_rays_say_and_corners_hide_what_is_behind_them(lo
     assert len(seen.ids) < 0.3 * len(everywhere)
 
 
+def test_the_town_is_driven_again_in_both_directions():
+    sequence = open_world("town")
+    truth = sequence.ground_truth
+    assert len(sequence) >= 1000
+    way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1))])
+    rows, again = cKDTree(truth.positions).query_pairs(5.0, output_type="ndarray").T
+    far = way[again] - way[rows] > 400
+    cosine = (truth.poses[rows[far], :3, 2] * truth.poses[again[far], :3, 2]).sum(axis=1)
+    assert len(np.unique(again[far][cosine > 0.95])) > 150
+    assert len(np.unique(again[far][cosine < -0.95])) > 100
+    assert np.ptp(truth.positions[:, 2]) < 0.2
+
+
 def test_a_wrong_calibration_is_told_and_the_true_one_records():
     right, wrong = open_world("town?sigma=0"), open_world("town?sigma=0&focal_error=0.005&turn_error=1")
     assert wrong.rig is right.rig
@@ -66,3 +79,11 @@ def test_a_wrong_calibration_is_told_and_the_true_one_records():
     centre = right.rig.left.u0, right.rig.left.v0
     ratio = (a.features.uv_left[i[still]] - centre) / (b.features.uv_left[j[still]] - centre)
     assert np.allclose(np.median(ratio, axis=0), 1.005, atol=1e-4)
+
+
+def test_a_real_path_shows_as_many_features_as_a_real_drive(slam_data):
+    sequence = open_world(f"drive?path={slam_data / 'kitti_paths' / '07.txt'}")
+    assert len(sequence) == 1101
+    stereo = [int(sequence.observations(k).has_stereo.sum()) for k in range(0, 1101, 40)]
+    assert 250 < np.median(stereo) < 600
+    assert min(stereo) > 80

@@ -1,0 +1,271 @@
+"""The papers' detector of a moving object (paper B, section 3, Procedure 1 and steps a to e).
+
+The object's features are known beforehand: a database of descriptors and 3D points of the initial scene. Three features
+give a body frame in the initial and in the current scene, and these give the object's motion. The papers name no
+covariance; here the stereo noise of the three points is carried through to first order. NOTES of the misprints: step e
+says "the image correspondence A′, B′, C′", meant are their 3D positions, ``A′ = F_j + R (A − M_j)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.bodies.config import ObjectsConfig
+from slam.bodies.detector import ObjectDetector
+from slam.data import Estimate, StereoFeatures
+from slam.errors import ConfigurationError
+from slam.files import array, read_bytes, unpack, whole_file
+from slam.geometry.arrays import isin
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, angles, inverse, log, pose, transform
+from slam.interfaces import Backend
+from slam.models import EstimatorModels
+from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
+from slam.tracks.follow import match_everywhere
+from slam.tracks.table import Tracks
+
+_ALIKE = 0.45, 0.8  # largest descriptor distance, and its largest ratio to the second best
+_LARGEST = 2**28  # bytes of a database's file
+_FARTHEST = 1e8  # guard: of its numbers
+_STEP = 1e-5  # numerics: of the finite differences [m]
+_CANDIDATES = 12  # cost: features with the largest determinants among which a triple is looked for
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectDatabase:
+    """What is known of an object beforehand: its features in the initial scene."""
+
+    points: Array  # 3D positions (M, 3) in world coordinates [m], M_j of step c
+    descriptors: NDArray[np.float32]  # (M, D) float32
+    laplacian: NDArray[np.int8]  # signs (M,) int8
+    origin: Array  # A (3,), the origin of the object's coordinates in the initial scene [m]
+
+    @classmethod
+    def of(
+        cls, features: StereoFeatures, rows: NDArray, rig: StereoRig, T_world_left: Array, origin: Array | None = None
+    ) -> ObjectDatabase:
+        """From the features of the initial scene that lie on the object; those without a stereo match are left out.
+
+        `origin` defaults to the point with the largest determinant.
+        """
+        rows = np.arange(len(features))[rows]
+        rows = rows[features.has_stereo[rows]]
+        rows = rows[np.argsort(-features.response[rows], kind="stable")]
+        points = transform(T_world_left, rig.triangulate(features.uv_left[rows], features.uv_right[rows]))
+        good = np.isfinite(points).all(axis=1)
+        rows, points = rows[good], points[good]
+        if len(rows) < 3:
+            raise ConfigurationError(f"object database: {len(rows)} features with a stereo match, 3 are needed")
+        A = points[0] if origin is None else np.asarray(origin, float)
+        return cls(points, features.descriptors[rows], features.laplacian[rows], A)
+
+    def save(self, path: Path) -> None:
+        """Write an .npz file, whole or not at all; raises ConfigurationError where it cannot be written."""
+        with whole_file(path, ConfigurationError) as file:
+            np.savez(
+                file, points=self.points, descriptors=self.descriptors, laplacian=self.laplacian, origin=self.origin
+            )  # fmt: skip
+
+    @classmethod
+    def load(cls, path: Path) -> ObjectDatabase:
+        """Read what `save` wrote; ConfigurationError where there is no such file, or it is none of a database."""
+        source = f"object database {path}"
+        members = unpack(read_bytes(path, _LARGEST, ConfigurationError), source, ConfigurationError)
+        names = ("points", "descriptors", "laplacian", "origin")
+        missing = [name for name in names if f"{name}.npy" not in members]
+        if missing:
+            raise ConfigurationError(f"{source}: damaged, or no database of an object: it lacks {missing[0]}")
+        arrays = [array(members[f"{name}.npy"], name, source, ConfigurationError) for name in names]
+        if any(a.ndim == 0 or a.dtype.kind not in "fi" for a in arrays):
+            raise ConfigurationError(f"{source}: its arrays are not of numbers")
+        points, descriptors, laplacian, origin = arrays
+        with np.errstate(over="ignore"):
+            database = cls(
+                points.astype(float), descriptors.astype(np.float32), np.sign(laplacian).astype(np.int8),
+                origin.astype(float),
+            )  # fmt: skip
+        n = len(points)
+        shapes = points.shape, origin.shape, laplacian.shape, descriptors.shape[:1]
+        if shapes != ((n, 3), (3,), (n,), (n,)) or descriptors.ndim != 2:
+            raise ConfigurationError(f"{source}: its arrays do not belong together")
+        if not all((np.abs(a.astype(float)) < _FARTHEST).all() for a in arrays):
+            raise ConfigurationError(f"{source}: a number is not finite, or impossibly large")
+        return database
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectMotion:
+    """The object's motion from the initial to the current scene, or why there is none."""
+
+    reason: str  # empty, or one line that says why there is no motion
+    R: Array  # ``R_2^1`` (3, 3) (step d)
+    rpy: Array  # roll, pitch, yaw (3,) [rad] of R by the printed formulas
+    translation: Array  # ``AA′`` (3,) [m] (step e)
+    triple: NDArray[np.intp]  # rows of the three features in the current scene (3,)
+    database: NDArray[np.intp]  # and in the database (3,)
+
+    @classmethod
+    def refused(cls, reason: str) -> ObjectMotion:
+        """No motion."""
+        none = np.full(3, np.nan)
+        return cls(reason, np.full((3, 3), np.nan), none, none, np.zeros(0, np.intp), np.zeros(0, np.intp))
+
+
+def body_frame(A: Array, B: Array, C: Array) -> Array:
+    """Rotation (3, 3) of the body frame of three points: columns x, y, z in world axes (paper B, Procedure 1).
+
+    x is along AB, y along AB × AC, z along AB × (AB × AC).
+    """
+    x = B - A
+    y = np.cross(x, C - A)
+    z = np.cross(x, y)
+    return np.column_stack([v / np.linalg.norm(v) for v in (x, y, z)])
+
+
+def why_degenerate(points: Array, least_side: float, least_sine: float) -> str:
+    """Why points A, B, C (3, 3) [m] make no frame: one line, or empty where they do.
+
+    Two of them are at least `least_side` [m] apart, and every angle has a sine of at least `least_sine`.
+    """
+    if not np.isfinite(points).all():
+        return "a point has no depth"
+    sides = points[[1, 2, 2]] - points[[0, 0, 1]]
+    lengths = np.linalg.norm(sides, axis=1)
+    if lengths.min() < 1e-9 + 0.1 * least_side:
+        return "two of the three points are nearly the same"
+    if lengths.min() < least_side:
+        return f"two of the three points are {1e3 * lengths.min():.0f} mm apart, {1e3 * least_side:.0f} mm are needed"
+    area = np.linalg.norm(np.cross(sides[0], sides[1]))
+    if area / np.sort(lengths)[1:].prod() < least_sine:
+        return "the three points are nearly collinear"
+    return ""
+
+
+def motion_of_triples(current: Array, initial: Array, origin: Array) -> tuple[Array, Array]:
+    """``R_2^1`` (3, 3) and ``AA′`` (3,) from three points in the current and initial scene (steps b to e)."""
+    R = body_frame(*current) @ body_frame(*initial).T
+    return R, current[0] + R @ (origin - initial[0]) - origin
+
+
+def detect(
+    features: StereoFeatures, matches: tuple[NDArray[np.intp], NDArray[np.intp]], points: Array,
+    database: ObjectDatabase, least_side: float = 0.08, least_sine: float = 0.3,
+) -> ObjectMotion:  # fmt: skip
+    """The object's motion by Procedure 1, from `matches` of the database's rows and the features' (K,) (step c).
+
+    The three with the largest determinant (of the Hessian, the detector's response) are taken (step a); where they make
+    no frame, see `why_degenerate`, the next ones. `points` (K, 3) are the features' in world coordinates [m].
+    """
+    known, rows = matches
+    if len(rows) < 3:
+        return ObjectMotion.refused(f"{len(rows)} features of the object recognised, 3 are needed")
+    order = np.argsort(-features.response[rows], kind="stable")[:_CANDIDATES]
+    reason = ""
+    for triple in sorted(combinations(range(len(order)), 3), key=lambda three: three[::-1]):  # by their weakest feature
+        three = order[list(triple)]
+        current, initial = points[three], database.points[known[three]]
+        why = why_degenerate(current, least_side, least_sine) or why_degenerate(initial, least_side, least_sine)
+        if not why:
+            R, AA = motion_of_triples(current, initial, database.origin)
+            return ObjectMotion("", R, angles(R), AA, rows[three], known[three])
+        reason = reason or why
+    return ObjectMotion.refused(reason)
+
+
+def motion_covariance(current: Array, initial: Array, origin: Array, noise: Array) -> Array:
+    """Covariance (6, 6), [rotation, translation] in body axes, by the noise (3, 3, 3) [m²] of the current points."""
+    T = _placed(current, initial, origin)
+    J: Array = np.empty((6, 9))
+    for column in range(9):
+        moved = current.copy()
+        moved[column // 3, column % 3] += _STEP
+        J[:, column] = log(inverse(T) @ _placed(moved, initial, origin)) / _STEP
+    P: Array = np.zeros((6, 6))
+    for i in range(3):
+        P += J[:, 3 * i : 3 * i + 3] @ noise[i] @ J[:, 3 * i : 3 * i + 3].T
+    return P
+
+
+def _placed(current: Array, initial: Array, origin: Array) -> Array:
+    R, AA = motion_of_triples(current, initial, origin)
+    return pose(R, origin + AA)
+
+
+class Procedure1Detector(ObjectDetector):
+    """The papers' detector in the system's place for one; the object is number 1.
+
+    Its body frame lies in the database's origin, along the world's axes in the initial scene. Without a `database` the
+    file that the settings name is read.
+    """
+
+    def __init__(
+        self, rig: StereoRig, config: ObjectsConfig, models: EstimatorModels, database: ObjectDatabase | None = None
+    ) -> None:
+        self.rig = rig
+        self.config = config
+        self.sigma = models.pixel_sigma
+        self.database = database if database is not None else ObjectDatabase.load(Path(config.database))
+        self.motion = ObjectMotion.refused("no frame yet")
+        self._rows = np.zeros(0, np.intp)
+        self._covariance: Array = np.eye(6)
+        self._last: tuple[float, Array] | None = None
+
+    def restart(self) -> None:
+        """The database goes on; the last pose does not."""
+        self._last = None
+
+    def step(
+        self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate, *_: object
+    ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
+        """Recognise the object's features and find its motion; no other feature is classified.
+
+        The object is reported where it was measured in this frame; the back end is not asked.
+        """
+        d = self.database
+        if d.descriptors.shape[1] != features.descriptors.shape[1]:
+            raise ConfigurationError(
+                f"objects: the database has descriptors of {d.descriptors.shape[1]} dimensions, the front end's have "
+                f"{features.descriptors.shape[1]}"
+            )
+        free = np.flatnonzero(features.has_stereo)
+        found = match_everywhere(d.descriptors, d.laplacian, features.select(free), *_ALIKE)
+        known, rows = found.tracks, free[found.features]
+        local = self.rig.triangulate(features.uv_left[rows], features.uv_right[rows])
+        points = transform(estimate.T_world_left, local)
+        self.motion = detect(features, (known, rows), points, d)
+        self._rows = rows
+        if not self.motion.reason:
+            at = np.array([np.flatnonzero(rows == row)[0] for row in self.motion.triple])
+            R = estimate.T_world_left[:3, :3]
+            noise = R @ self.rig.triangulation_covariance(local[at], self.sigma) @ R.T
+            self._covariance = motion_covariance(points[at], d.points[self.motion.database], d.origin, noise)
+        moved = np.sort(tracks.ids[(tracks.ids >= 0) & isin(tracks.row, rows)])
+        return MotionLabels(np.sort(rows), np.zeros(0, np.intp), moved), self._reported(features)
+
+    def _reported(self, features: StereoFeatures) -> tuple[MovingObject, ...]:
+        if self.motion.reason:
+            return ()
+        d = self.database
+        found = pose(np.eye(3), d.origin)
+        T = pose(self.motion.R, d.origin + self.motion.translation)
+        before = self._last or (features.stamp, T)
+        step = T @ inverse(before[1])
+        dt = features.stamp - before[0]
+        velocity = np.zeros(6) if dt <= 0 else np.concatenate([log(step)[:3], T[:3, 3] - before[1][:3, 3]]) / dt
+        self._last = features.stamp, T
+        none = np.zeros(0, np.int64)
+        estimate = ObjectEstimate(
+            1, features.stamp, T, self._covariance, velocity, np.full((6, 6), np.nan), True, none, none
+        )  # fmt: skip
+        local = d.points - d.origin
+        extent = np.stack([local.min(axis=0), local.max(axis=0)])
+        return (
+            MovingObject(
+                1, np.sort(self._rows), estimate, step, T @ inverse(found), extent, True, measured_at=features.stamp
+            ),
+        )
