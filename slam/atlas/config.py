@@ -29,8 +29,9 @@ class AtlasConfig:
     features: ClassVar[int] = 400
     #: A place counts as left once the camera has gone this many times the median depth of what it saw.
     return_depths: ClassVar[float] = 3.0
-    #: A place is seen again only from within this many times that depth.
-    view_depths: ClassVar[float] = 3.0
+    #: A place is seen again only from within this many times that depth: fewer, or each place that is passed on a
+    #: straight road would be looked for once.
+    view_depths: ClassVar[float] = 2.0
     #: Drift of the path as a share of its length, besides its covariance; places farther off are not compared.
     drift: ClassVar[float] = 0.02
     #: Number of keyframes that are compared in detail with a new one.

@@ -108,7 +108,6 @@ def _number(name: str, value: Any) -> float:
 
 
 def _column(name: str, array: Any, rows: int) -> Array:
-    """One column with its documented dtype."""
     shape, dtype = _COLUMNS[name]
     kinds = "i" if dtype is np.int8 else "f"
     if not isinstance(array, np.ndarray) or array.ndim != 1 + len(shape) or array.dtype.kind not in kinds:

@@ -83,7 +83,6 @@ class InputWarnings:
         self._count += 1
 
     def _check_intervals(self, interval: float) -> None:
-        """Warn of stamps in another unit, and of frames too far apart in time to predict the motion between."""
         if not 0 < interval < float("inf"):
             return  # a step refuses them
         if not SHORTEST <= interval <= LONGEST:

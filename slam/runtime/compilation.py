@@ -193,8 +193,6 @@ class _Inlined(JITCodeLibrary):
 
 
 class _Helper(Compiler):
-    """Compiles helpers."""
-
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self.state.library = _Inlined(self.state.targetctx.codegen(), "helper")
