@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -86,8 +85,7 @@ def world_row(world: str, options: str, seeds: int) -> list[str]:
 def show_drives(drives: Mapping[str, Path], out: Path, frames: int | None) -> None:
     """Corrections by each drive that both of them show, and how far apart they are."""
     sequences = [open_sequence(f) for f in drives.values()]
-    quiet = nullcontext(lambda _: None)
-    found = calibrate(sequences, out / "rig.json", lambda *_: quiet, (), (0, frames), overwrite=True)
+    found = calibrate(sequences, out / "rig.json", (), (0, frames), overwrite=True)
     alone = [one["parameters"] for one in found["recordings"]]
     rows = []
     for k, row in enumerate(found["parameters"]):

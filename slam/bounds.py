@@ -23,9 +23,6 @@ LEAST = 1e-9
 _COUNTS = 10**6  # whole numbers of settings: of frames, features, landmarks
 _WORD, _TUPLE = 4096, 16  # most characters of a text, most elements of a tuple
 
-#: Ranges of fields whose cost grows faster than their value, in every class.
-_COSTLY = {"grid": (1, 1000)}
-
 _C = TypeVar("_C")
 Ranges = Mapping[str, tuple[float, float]]
 
@@ -38,7 +35,7 @@ def require_positive(config: object, ranges: Ranges | None = None, owner: str = 
     """
     mark, hints = f"{owner}: " if owner else "", _hints(type(config))  # type: ignore[arg-type]
     for f in fields(config):  # type: ignore[arg-type]
-        value, limits = getattr(config, f.name), (ranges or {}).get(f.name, _COSTLY.get(f.name))
+        value, limits = getattr(config, f.name), (ranges or {}).get(f.name)
         fault = _type_fault(value, hints[f.name])
         numbers_of = value if isinstance(value, (tuple, list)) and not fault else (value,)
         faults = [fault, *(_range_fault(number, limits, positive) for number in numbers_of if not fault)]
@@ -69,7 +66,6 @@ def _range_fault(value: Any, limits: tuple[float, float] | None, positive: bool)
 
 @lru_cache(maxsize=64)
 def _hints(kind: type) -> dict[str, Any]:
-    """Types of a dataclass's fields."""
     return get_type_hints(kind)
 
 
@@ -79,7 +75,6 @@ def _is(kind: Any) -> Callable[[Any], bool]:
 
 
 def _maps_names(value: Any) -> bool:
-    """Whether a value is a mapping of names."""
     return isinstance(value, dict) and all(isinstance(key, str) for key in value)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam.errors import MeasurementError
 from slam.geometry.arrays import Array, BoolArray, IdArray, LandmarkRows
-from slam.geometry.se3 import LEAST_VARIANCE
+from slam.geometry.se3 import LEAST_VARIANCE, is_rotation
 
 #: Limits of a measurement: farthest pixel from the origin [px], latest stamp from zero [s].
 FARTHEST_PIXEL, LATEST_STAMP = 1e5, 1e12
@@ -50,20 +50,15 @@ def require_not_measured(owner: str, measured: bool) -> None:
 
 def is_rigid(T: Array, tolerance: float) -> bool:
     """Whether T (4, 4) is a rotation and a translation, as far as a double can tell what a camera sees there."""
-    if T.shape != (4, 4) or not (np.abs(T) <= FARTHEST_POSITION).all() or np.abs(T[:3, :3]).max() >= 1.1:
-        return False
-    R = T[:3, :3]
-    return bool(np.abs(R @ R.T - np.eye(3)).max() <= tolerance and np.linalg.det(R) > 0)
+    near = T.shape == (4, 4) and bool((np.abs(T) <= FARTHEST_POSITION).all())  # false for NaN, too
+    return near and bool(is_rotation(T[:3, :3], tolerance))
 
 
 def require_guess(owner: str, guess: Array | None) -> None:
     """Raise MeasurementError where a guess of the camera's pose is no rigid motion (4, 4)."""
-    if guess is None:
-        return
-    if not isinstance(guess, np.ndarray) or guess.shape != (4, 4) or not np.isfinite(guess).all():
-        raise MeasurementError(f"{owner}: the guess must be a finite pose, an array (4, 4)")
-    if not is_rigid(guess, 1e-3) or (guess[3] != (0, 0, 0, 1)).any():
-        raise MeasurementError(f"{owner}: the guess must be a rigid motion: a rotation and a translation")
+    fine = guess is None or (isinstance(guess, np.ndarray) and is_rigid(guess, 1e-3))
+    if not fine or (guess is not None and (guess[3] != (0, 0, 0, 1)).any()):
+        raise MeasurementError(f"{owner}: the guess must be an array (4, 4): a rotation and a translation")
 
 
 def require_recent(owner: str, n: int) -> int:

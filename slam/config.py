@@ -15,30 +15,22 @@ from slam.models import EstimatorModels, models_for
 from slam.settings import apply_settings
 from slam.tracks.config import AssociationConfig, MapConfig
 
-#: Map management by kind of motion: a car does not soon return to what it has passed, and gets so much nearer to what
-#: lies ahead that descriptors change. With more landmarks errors on drives are no smaller (`experiments/knee.py`).
-MAPS = {
-    "handheld": MapConfig(),
-    "driving": MapConfig(target_in_view=100, max_landmarks=133, descriptor_update=1.0, confirmed=1, spacing=0.0),
-}
-
-#: Association by kind of motion: in a car, descriptors are updated on approach, so the angle and distance of view are
-#: not limited. Features are not aligned to their first sight: recorded drives gain nothing by it
-#: (`experiments/ablation.py`).
-ASSOCIATIONS = {
-    "handheld": AssociationConfig(),
-    "driving": AssociationConfig(view_angle=180.0, view_ratio=1e6, align=False),
-}
-
-#: Moving objects by kind of motion: traffic is faster than what a hand or a robot moves.
-OBJECTS = {
-    "handheld": ObjectsConfig(),
-    "driving": ObjectsConfig(max_speed=25.0, min_speed=1.0, suspect=40.0, size=2.0),
+#: What is set by kind of motion. A car does not soon return to what it has passed, and gets so much nearer to what lies
+#: ahead that descriptors change. They are updated on approach, so the angle and distance of view are not limited.
+#: Neither more landmarks (`experiments/knee.py`) nor features aligned to their first sight (`experiments/ablation.py`)
+#: make recorded drives better. Traffic is faster than what a hand or a robot moves.
+_BY_KIND: dict[str, dict[str, Any]] = {
+    "handheld": {},
+    "driving": {
+        "map": MapConfig(target_in_view=100, max_landmarks=133, descriptor_update=1.0, confirmed=1, spacing=0.0),
+        "association": AssociationConfig(view_angle=180.0, view_ratio=1e6, align=False),
+        "objects": ObjectsConfig(max_speed=25.0, min_speed=1.0, suspect=40.0, size=2.0),
+    },
 }
 
 #: Options of a front end that suit a kind of motion: a car does not roll, a hand-held camera does; nothing comes
 #: within a metre of the cameras of a car. More features make drives no better (`experiments/knee.py`).
-FRONTENDS: dict[tuple[str, str | None], dict[str, Any]] = {
+_FRONTENDS: dict[tuple[str, str | None], dict[str, Any]] = {
     ("handheld", "surf"): {"upright": False},
     ("driving", "surf"): {"features": 600, "upright": True, "min_depth": 1.0},
 }
@@ -85,14 +77,8 @@ class SystemConfig:
         Raises:
             ConfigurationError: the kind is not known.
         """
-        models = models_for(kind)
-        return cls(
-            models=models,
-            association=ASSOCIATIONS[kind],
-            map=MAPS[kind],
-            objects=OBJECTS[kind],
-            frontend=dict(FRONTENDS.get((kind, frontend), {})),
-        )
+        models, options = models_for(kind), dict(_FRONTENDS.get((kind, frontend), {}))
+        return cls(models=models, frontend=options, **_BY_KIND[kind])
 
     def to_json(self) -> dict[str, Any]:
         """The tree as plain types."""

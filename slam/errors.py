@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sysconfig
 from pathlib import Path
 from traceback import extract_tb
 
@@ -23,9 +24,16 @@ def text_of(error: BaseException) -> str:
         return ""
 
 
+#: Where code is that nobody mends for a back end of their own, beside installed packages.
+_OURS = (str(Path(__file__).parents[1] / name) for name in ("slam", "backends", "frontends"))
+_LIBRARIES = ("<", sysconfig.get_path("stdlib"), *_OURS)
+
+
 def cause(error: BaseException) -> str:
-    """An exception of third-party code in words, with the line that raised it."""
-    place = extract_tb(error.__traceback__)[-1]
+    """An exception of third-party code in words, with the last line of it, be it in a call of a library or of ours."""
+    frames = extract_tb(error.__traceback__)
+    theirs = [at for at in frames if not at.filename.startswith(_LIBRARIES) and "-packages" not in at.filename]
+    place = (theirs or frames)[-1]
     text = f": {said}" if (said := text_of(error)) else ""
     return f"{type(error).__name__}{text} ({Path(place.filename).name}, line {place.lineno})"
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import os
 import secrets
 import stat
@@ -34,7 +33,6 @@ _JSON_LIMIT = 16 * _MEBI
 _AT_LEAST, _TIMES = 64 * 2**20, 50
 
 _MEMBERS = 100  # most members of an archive
-_HEADER = 10_000  # bytes of an array's header
 _KINDS = "biufU"  # of arrays: numbers and text, never objects
 _TEXT = 2**20  # characters of a text that is read as JSON
 
@@ -126,21 +124,12 @@ def unpack(data: bytes, source: str, error: type[SlamError] = SlamError) -> dict
 
 
 def array(data: bytes, name: str, source: str, error: type[SlamError] = SlamError) -> np.ndarray:
-    """The array of an ``.npy`` member, whose header must agree with the data; raises `error` where it is none."""
+    """The array of numbers or text in an ``.npy`` member; raises `error` where it is none."""
     try:
-        stream = io.BytesIO(data)
-        version = np.lib.format.read_magic(stream)
-        if version not in ((1, 0), (2, 0)):
-            raise ValueError(f"version {version}")
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = read(stream, max_header_size=_HEADER)
-        body, count = data[stream.tell() :], math.prod(shape)
-        if dtype.kind not in _KINDS:
-            raise ValueError(f"of type {dtype}")
-        if min(shape, default=0) < 0 or max(shape, default=0) >= 2**31 or count * dtype.itemsize != len(body):
-            raise ValueError(f"{len(body)} bytes for shape {shape} of {dtype}")
-        flat = np.frombuffer(body, dtype) if dtype.itemsize else np.zeros(count, dtype)
-        return flat.reshape(shape, order="F" if fortran else "C").copy()
+        found = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+        if found.dtype.kind not in _KINDS or not found.dtype.itemsize:
+            raise ValueError(f"of type {found.dtype}")
+        return np.asarray(found, order="C")
     except Exception as fault:  # likewise
         raise error(f"{source}: {name} cannot be read as an array: {_text(fault)}") from fault
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from inspect import Parameter, signature
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -27,97 +28,105 @@ def guarded(backend: Any) -> Any:
     Answers are copies: what the caller writes into them does not reach the back end. Of its additional methods those
     that move the camera or the map count here, too; but what these are given, it checks itself.
     """
-    name, parameters = backend.__name__, signature(backend).parameters.values()
-    any_option = any(p.kind is Parameter.VAR_KEYWORD for p in parameters)
-
-    class Guarded:
-        def __init__(self, rig: StereoRig, models: EstimatorModels | None = None, **options: Any) -> None:
-            unknown = set(options) - {p.name for p in parameters}
-            if unknown and not any_option:
-                raise ConfigurationError(f"{name}: unknown option {min(unknown)!r}")
-            self._backend, self._rig = backend(rig, models or EstimatorModels(), **options), rig
-            self._ids, self._measured, self._stamp = set[int](), True, float("nan")
-
-        def __getattr__(self, attribute: str) -> Any:  # what else the back end has
-            if attribute.startswith("_"):
-                raise AttributeError(attribute)
-            return getattr(self._backend, attribute)
-
-        def _require(self, ids: IdArray | Sequence[int] = (), known: bool = True) -> list[int]:
-            """Ids as numbers; raises MeasurementError before the start, or where one is not in the map, or in it."""
-            if np.isnan(self._stamp):
-                raise MeasurementError(f"{name}: the first call is predict")
-            numbers: list[int] = np.asarray(ids, np.int64).tolist()
-            for i in numbers:
-                if (i in self._ids) is not known:
-                    raise MeasurementError(f"{name}: landmark {i} is {'not in' if known else 'already in'} the map")
-            return numbers
-
-        def predict(self, stamp: float) -> Prediction:
-            return self._to(stamp, self._backend.predict)
-
-        def predict_at_rest(self, stamp: float) -> Prediction:
-            return self._to(stamp, self._backend.predict_at_rest)
-
-        def _to(self, stamp: float, predict: Callable[[float], Prediction]) -> Prediction:
-            require_stamp(name, stamp, None if np.isnan(self._stamp) else self._stamp)
-            found = deepcopy(predict(float(stamp)))
-            self._stamp, self._measured = float(stamp), False
-            return found
-
-        def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
-            self._require(observations.ids)
-            require_not_measured(name, self._measured)
-            require_guess(name, guess)
-            report = UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
-            report = deepcopy(self._backend.update(observations, guess)) if len(observations) else report
-            self._measured = True
-            return report
-
-        def revise(self, correct: Callable[[Array], Array]) -> None:
-            self._backend.revise(correct)
-            self._measured = True
-
-        def add(self, observations: Observations) -> None:
-            ids = self._require(observations.ids, known=False)
-            if not np.isfinite(self._rig.triangulate(observations.uv_left, observations.uv_right)).all():
-                raise MeasurementError(f"{name}: a landmark has no right pixel or no positive depth")
-            if ids:
-                self._backend.add(observations)
-                self._ids, self._measured = self._ids | set(ids), True
-
-        def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
-            self._backend.insert(ids, positions, covariances)
-            self._ids = self._ids | set(np.asarray(ids).tolist())
-
-        def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
-            self._require(ids, known=False)
-            self._backend.place(ids, local, covariances)
-            self._ids, self._measured = self._ids | set(np.asarray(ids).tolist()), True
-
-        def remove(self, ids: IdArray | Sequence[int]) -> None:
-            gone = self._require(ids)
-            self._backend.remove(np.array(gone, np.int64))
-            self._ids = self._ids - set(gone)
-
-        def positions(self, ids: IdArray) -> Array:
-            found: Array = deepcopy(self._backend.positions(np.array(self._require(ids), np.int64)))
-            return found
-
-        def estimate(self, landmarks: bool = True) -> Estimate:
-            self._require()
-            found: Estimate = deepcopy(self._backend.estimate(landmarks))
-            return found
-
-        def trajectory(self) -> Trajectory:
-            found: Trajectory = deepcopy(self._backend.trajectory())
-            return found
-
-    own = {key: getattr(backend, key) for key in ("__name__", "__qualname__", "__module__", "__doc__")}
-    for attribute, value in {**own, "__wrapped__": backend}.items():  # it is found and named as that class
-        setattr(Guarded, attribute, value)
+    own = {key: getattr(backend, key) for key in ("__qualname__", "__module__", "__doc__")}
+    others = [name for name in dir(backend) if not name.startswith("_") and not hasattr(_Guarded, name)]
+    passed = {name: vars(_Additional).get(name, property(attrgetter(f"_backend.{name}"))) for name in others}
     backend.__qualname__ += ".__wrapped__"  # where pickle finds it
-    for attribute in ("predict_at_rest", "revise", "insert", "place"):
-        if not hasattr(backend, attribute):
-            delattr(Guarded, attribute)
-    return Guarded
+    return type(backend.__name__, (_Guarded,), {**own, **passed, "__wrapped__": backend})
+
+
+class _Guarded:
+    """See `guarded`: each back end's class, in `__wrapped__`, has a subclass."""
+
+    __wrapped__: Any
+
+    def __init__(self, rig: StereoRig, models: EstimatorModels | None = None, **options: Any) -> None:
+        self._name, self._rig, parameters = type(self).__name__, rig, signature(self.__wrapped__).parameters.values()
+        unknown = set(options) - {p.name for p in parameters}
+        if unknown and not any(p.kind is Parameter.VAR_KEYWORD for p in parameters):
+            raise ConfigurationError(f"{self._name}: unknown option {min(unknown)!r}")
+        self._backend = self.__wrapped__(rig, models or EstimatorModels(), **options)
+        self._ids, self._measured, self._stamp = set[int](), True, float("nan")
+
+    def __getattr__(self, attribute: str) -> Any:  # what the back end sets itself
+        if attribute.startswith("_"):
+            raise AttributeError(attribute)
+        return getattr(self._backend, attribute)
+
+    def _require(self, ids: IdArray | Sequence[int] = (), known: bool = True) -> list[int]:
+        """Ids as numbers; raises MeasurementError before the start, or where one is not in the map, or in it."""
+        if np.isnan(self._stamp):
+            raise MeasurementError(f"{self._name}: the first call is predict")
+        numbers: list[int] = np.asarray(ids, np.int64).tolist()
+        for i in numbers:
+            if (i in self._ids) is not known:
+                raise MeasurementError(f"{self._name}: landmark {i} is {'not in' if known else 'already in'} the map")
+        return numbers
+
+    def _count(self, ids: IdArray) -> None:
+        self._ids = self._ids | set(np.asarray(ids).tolist())
+
+    def predict(self, stamp: float) -> Prediction:
+        return self._to(stamp, self._backend.predict)
+
+    def _to(self, stamp: float, predict: Callable[[float], Prediction]) -> Prediction:
+        require_stamp(self._name, stamp, None if np.isnan(self._stamp) else self._stamp)
+        found = deepcopy(predict(float(stamp)))
+        self._stamp, self._measured = float(stamp), False
+        return found
+
+    def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
+        self._require(observations.ids)
+        require_not_measured(self._name, self._measured)
+        require_guess(self._name, guess)
+        report = UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
+        report = deepcopy(self._backend.update(observations, guess)) if len(observations) else report
+        self._measured = True
+        return report
+
+    def add(self, observations: Observations) -> None:
+        self._require(observations.ids, known=False)
+        if not np.isfinite(self._rig.triangulate(observations.uv_left, observations.uv_right)).all():
+            raise MeasurementError(f"{self._name}: a landmark has no right pixel or no positive depth")
+        if len(observations):
+            self._backend.add(observations)
+            self._count(observations.ids)
+            self._measured = True
+
+    def remove(self, ids: IdArray | Sequence[int]) -> None:
+        gone = self._require(ids)
+        self._backend.remove(np.array(gone, np.int64))
+        self._ids = self._ids - set(gone)
+
+    def positions(self, ids: IdArray) -> Array:
+        return np.array(self._backend.positions(np.array(self._require(ids), np.int64)))
+
+    def estimate(self, landmarks: bool = True) -> Estimate:
+        self._require()
+        found: Estimate = deepcopy(self._backend.estimate(landmarks))
+        return found
+
+    def trajectory(self) -> Trajectory:
+        found: Trajectory = deepcopy(self._backend.trajectory())
+        return found
+
+
+class _Additional(_Guarded):
+    """What counts, too, where the back end has it; all else that it has is passed on."""
+
+    def predict_at_rest(self, stamp: float) -> Prediction:
+        return self._to(stamp, self._backend.predict_at_rest)
+
+    def revise(self, correct: Callable[[Array], Array]) -> None:
+        self._backend.revise(correct)
+        self._measured = True
+
+    def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
+        self._backend.insert(ids, positions, covariances)
+        self._count(ids)
+
+    def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
+        self._require(ids, known=False)
+        self._backend.place(ids, local, covariances)
+        self._count(ids)
+        self._measured = True

@@ -66,7 +66,10 @@ def resolve(role: str, name: str) -> Any:
     what, own = _spoken(role), ":" in name
     target = name if own else _table(role).get(name)
     if target is None:
-        raise UnknownNameError(f"{unknown(what, name, names(role))}; or one of your own: module:Class")
+        if name == "simulated":
+            raise UnknownNameError(f"{what} {name!r} is for `slam compare` alone; known: {', '.join(names(role))}")
+        own_module = name if Path(f"{name}.py").is_file() else "module"
+        raise UnknownNameError(f"{unknown(what, name, names(role))}; or one of your own: {own_module}:Class")
     failed = f"{what} {name!r} cannot be loaded:"
     if not own and name in BUILT_IN[role] and (hidden := _hidden(role)):
         raise UnknownNameError(f"{failed} {hidden}")
@@ -83,6 +86,8 @@ def resolve(role: str, name: str) -> Any:
             where = f": {_hidden(package) or f'`{package}` is the package of slam, so call yours by another name'}"
         elif own and package == module.partition(".")[0]:
             where = f"; looked for in {Path.cwd()}, where `slam` runs, among the installed packages, and in PYTHONPATH"
+        elif own:  # what the module itself imports
+            raise UnknownNameError(f"{failed} {cause(error)}") from error
         raise UnknownNameError(f"{failed} {text_of(error)}{where}") from error
     except (ImportError, AttributeError, ValueError, TypeError, SyntaxError) as error:
         raise UnknownNameError(f"{failed} {text_of(error)}") from error
@@ -91,7 +96,6 @@ def resolve(role: str, name: str) -> Any:
 
 
 def _spoken(role: str) -> str:
-    """A role in words: "back end" or "front end"."""
     return role[:-1].replace("end", " end")
 
 

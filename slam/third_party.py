@@ -76,12 +76,14 @@ def named_failures(place: str, *parts: object) -> Iterator[None]:
 
     If all parts are our own, exceptions pass unchanged. `place` is the present operation, for the message.
     """
+    foreign = [part for part in parts if type(part).__module__.partition(".")[0] not in _OURS]
     try:
         yield
-    except SlamError:
+    except SlamError as error:
+        if any(str(error).startswith(f"{type(part).__name__}.") for part in foreign):  # an answer that was `checked`
+            raise SlamError(f"{place}: {error}") from error
         raise
     except (Exception, SystemExit) as error:  # whatever a third-party class does
-        foreign = [part for part in parts if type(part).__module__.partition(".")[0] not in _OURS]
         *_, (last, _) = walk_tb(error.__traceback__)
         by_part = last.f_globals.get("__name__") in [type(part).__module__ for part in foreign]
         if not foreign or (isinstance(error, SystemExit) and not by_part):  # as of a signal handler elsewhere

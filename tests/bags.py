@@ -63,8 +63,8 @@ def info(store, baseline: float, R: np.ndarray = R_LEFT, **change):
     return types[INFO](**{**values, **change})
 
 
-def stereo(store, count: int = 6, late: int = 0):
-    """Topic, kind, time of recording and message of a stereo recording whose right images come `late` ns later."""
+def stereo(store, count: int = 6):
+    """Topic, kind, time of recording and message of a stereo recording."""
     rows = [
         ("/stereo/left/camera_info", INFO, T0, info(store, 0.0)),
         ("/stereo/right/camera_info", INFO, T0, info(store, 0.2, R_RIGHT)),
@@ -72,7 +72,7 @@ def stereo(store, count: int = 6, late: int = 0):
     for k in range(count):
         stamp = T0 + k * STEP
         rows.append((LEFT, RAW, stamp + 1000, image(store, stamp, picture(k))))
-        rows.append((RIGHT, RAW, stamp + 2000 + late, image(store, stamp + 1_000_000, picture(k + 10))))
+        rows.append((RIGHT, RAW, stamp + 2000, image(store, stamp + 1_000_000, picture(k + 10))))
     return rows
 
 

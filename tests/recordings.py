@@ -7,6 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from slam.geometry.rig import StereoRig
+
 WIDTH, HEIGHT = 64, 48
 
 #: The calibration of a rectified rig.
@@ -22,7 +24,7 @@ rate_hz: 20
 resolution: [{width}, {height}]
 camera_model: pinhole
 intrinsics: [50.0, 51.0, 31.5, 23.5]
-distortion_model: {model}
+distortion_model: radial-tangential
 distortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]
 """
 
@@ -30,10 +32,10 @@ distortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]
 BODY_CAMERA = np.array([[0.0, -1.0, 0.0, 0.02], [1.0, 0.0, 0.0, -0.06], [0.0, 0.0, 1.0, 0.01], [0.0, 0.0, 0.0, 1.0]])
 
 
-def picture(seed: int, width: int = WIDTH, height: int = HEIGHT, depth: type = np.uint8) -> np.ndarray:
+def picture(seed: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     """A picture that is told from others by its mean."""
     noise = np.random.default_rng(seed).integers(0, 4, (height, width))
-    return (10 * (seed + 1) + noise).astype(depth)
+    return (10 * (seed + 1) + noise).astype(np.uint8)
 
 
 def seeds(sequence) -> list[tuple[int | None, int | None]]:
@@ -51,9 +53,9 @@ def rename(folder: Path, name) -> None:
         path.rename(folder / name(i))
 
 
-def write_image(path: Path, seed: int, width: int = WIDTH, height: int = HEIGHT, depth: type = np.uint8) -> None:
+def write_image(path: Path, seed: int, width: int = WIDTH, height: int = HEIGHT) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), picture(seed, width, height, depth))
+    assert cv2.imwrite(str(path), picture(seed, width, height))
 
 
 def cut(path: Path, share: float = 0.5) -> None:
@@ -62,18 +64,18 @@ def cut(path: Path, share: float = 0.5) -> None:
     path.write_bytes(data[: int(len(data) * share)])
 
 
-def write_sensor(path: Path, baseline: float = 0.11, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
+def write_sensor(path: Path, baseline: float = 0.11) -> None:
     """EuRoC's sensor.yaml of a camera `baseline` to the right of camera 0."""
     T = BODY_CAMERA.copy()
     T[:3, 3] += T[:3, 0] * baseline
     path.parent.mkdir(parents=True, exist_ok=True)
     numbers = ", ".join(str(x) for x in T.ravel())
-    path.write_text(SENSOR.format(T=numbers, width=size[0], height=size[1], model="radial-tangential"))
+    path.write_text(SENSOR.format(T=numbers, width=WIDTH, height=HEIGHT))
 
 
-def write_csv(camera: Path, stamps: list[int], ending: str = ".png") -> None:
+def write_csv(camera: Path, stamps: list[int]) -> None:
     camera.mkdir(parents=True, exist_ok=True)
-    lines = ["#timestamp [ns],filename", *(f"{s},{s}{ending}" for s in stamps)]
+    lines = ["#timestamp [ns],filename", *(f"{s},{s}.png" for s in stamps)]
     (camera / "data.csv").write_text("\n".join(lines) + "\n")
 
 
@@ -165,3 +167,19 @@ def write_video(path: Path, images: list[np.ndarray], codec: str = "mp4v", rate:
     for pixels in images:
         writer.write(cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR))
     writer.release()
+
+
+def write_opencv(path: Path, rig: StereoRig) -> None:
+    """Write a rig, as recorded, with the entries of ``cv2.stereoCalibrate`` [m]."""
+    left, right, R, b = rig.as_recorded
+    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
+    storage.write("image_width", left.width)
+    storage.write("image_height", left.height)
+    if rig.left.model == "equidistant":
+        storage.write("distortion_model", "equidistant")
+    for number, camera in enumerate((left, right), 1):
+        storage.write(f"K{number}", camera.K)
+        storage.write(f"D{number}", np.array([camera.distortion or (0.0,) * 4]))
+    storage.write("R", R)
+    storage.write("T", (R @ b).reshape(3, 1))
+    path.write_text(storage.releaseAndGetString())

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import slam
-from backends.ekf import EkfBackend
 from experiments.parameters import find
 from experiments.sensitivity import name_of
 from frontends.surf import SurfConfig
@@ -22,9 +21,8 @@ from slam.evaluation.metrics import absolute_errors
 from slam.geometry import se3
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
-from slam.sequences.rigs import write_opencv
 from slam.settings import can_be_set
-from tests.recordings import write_storage, write_video
+from tests.recordings import write_opencv, write_storage, write_video
 from tests.scripts import load_script
 
 ROOT = Path(__file__).parent.parent
@@ -186,8 +184,6 @@ _FRAMES = 11
 
 def reader_has(name):
     """What the Python of a page takes for granted."""
-    if name == "docs/adding_a_backend.md":
-        return {"MyBackend": EkfBackend}
     if name == "docs/selfcalibration.md":
         rig = slam.open_sequence("synthetic:street?frames=2").rig
         slam.save_calibration("rig.json", slam.StereoSlam(rig).calibration.kept())

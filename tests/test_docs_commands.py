@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 FEW = 4  # frames
 SHELLS = ("sh", "shell", "bash")  # consoles have tests of their own
 #: First words of what installs, tests or builds the package itself: `.ci/run` does all of it.
-OF_THE_PACKAGE = {"pip", "pytest", "ruff", "mypy", "mkdocs", "pre-commit", "python3", ".", ".ci/run"}
+OF_THE_PACKAGE = {"git", "cd", "pip", "pytest", "ruff", "mypy", "mkdocs", "pre-commit", "python3", ".", ".ci/run"}
 #: A camera, recordings of ROS, and timings.
 NOT_AT_HAND = re.compile(r"^camera:|\.(bag|mcap|db3)(\?|$)|^walk_folder$|^benchmarks/")
 #: What the page shows, and what is run in its place.

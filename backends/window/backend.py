@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from backends.window.history import History, state_corrected
+from backends.window.history import History, newest_kept, state_corrected
 from backends.window.state import WindowConfig, WindowState, settle
 from backends.window.steps import Steps
 from slam.bounds import from_options
@@ -197,6 +197,7 @@ class WindowBackend:
         """
         if len(self._state.frames):
             s = state_corrected(self._state, self._steps.stereo, correct, self.revises_path)
+            s = s if self._history.anchored else newest_kept(s, self._steps.stereo)
             self._history = self._history.corrected(self._steps.stereo, correct)
             self._state, self._revised = replace(s, measured=True), int(s.frames[-1])
 

@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from backends.window.slide import problem
 from backends.window.state import WindowState, settle
 from backends.window.steps import Steps
 from slam.data import IdArray
 from slam.geometry.arrays import changed
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, inverse
 from slam.window import chart_kernels
+from slam.window.solver import solve
 from slam.window.stereo import RectifiedStereo
 
 _EVERY = 25  # cost: frames between two states from which the calls can be repeated
@@ -74,6 +76,19 @@ class History:
             for frame, T in settled.items():
                 final[frame] = T
         return s, final
+
+
+def newest_kept(s: WindowState, stereo: RectifiedStereo) -> WindowState:
+    """A state with corrected measurements, whose newest pose stays where it is when they are solved for.
+
+    The first pose holds what is known of the place in the world: it and the whole path with it move instead.
+    """
+    try:
+        solution = solve(problem(s, stereo))
+    except np.linalg.LinAlgError:
+        return s
+    M = s.poses[-1] @ inverse(solution.window.poses[-1])
+    return changed(s, prior=changed(s.prior, T=M @ s.prior.T), cost=solution.cost)
 
 
 def _newest(s: WindowState) -> int:

@@ -76,17 +76,20 @@ def close(atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Traject
 
 
 def _refused(atlas: Atlas, chain: Chain, loop: Loop, rig: CommonError) -> Atlas:
-    """Refuse a loop that contradicts path and others, or the others if fewer places support them."""
+    """Refuse a loop that contradicts path and others, or the others if fewer places support them.
+
+    Neither is refused if all that was seen of these places, solved together, agrees.
+    """
     start = atlas.in_map(chain.poses)
     atlas = replace(atlas.with_inactive_loop(loop), refused=(*atlas.refused, loop.pair))
-    if not atlas.loops or len(spaced(atlas, atlas.inactive_loops)) < 2:
+    if not atlas.loops:
         return atlas
-    every = (*atlas.loops, *atlas.inactive_loops)
-    rival, present = agreeing(chain, every, loop, chain.poses), agreeing(chain, every, atlas.loops[-1], start)
+    every, before = (*atlas.loops, *atlas.inactive_loops), {x.pair for x in atlas.loops}
+    rival = agreeing(chain, every, loop, chain.poses)
     places = spaced(atlas, rival)
-    if len(places) <= len(spaced(atlas, present)):
+    contradicted = not before <= {x.pair for x in rival}
+    if contradicted and len(places) <= len(spaced(atlas, agreeing(chain, every, atlas.loops[-1], start))):
         return atlas
-    before = {x.pair for x in atlas.loops}
     held = {x.pair: x for x in (*places, *(x for x in rival if x.pair in before), loop)}
     atlas = atlas.with_loops(sorted(held.values(), key=lambda x: x.second), rival)
     return atlas.solved_by(PoseGraph.solved(chain, atlas.loops, start), rig)

@@ -3,31 +3,27 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
-from slam.commands.display import progress
+from slam.commands.display import empty_table, progress
+from slam.commands.run import frame_count
 from slam.config import SystemConfig
-from slam.data import FrameResult
 from slam.errors import ConfigurationError
 from slam.files import noting_inputs
 from slam.run.calibrating import calibrate as run
-from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
 from slam.settings import require_settable
 
 _SIGN = (
     "Corrections are added to measured pixels, seen from the principal point: cx and f are positive where the "
     "calibration's are too large. Usual is how far good calibrations are off in that parameter alone; several together "
-    "may cancel, so the pixels below say whether it is much."
+    "may cancel, so the pixels above say whether it is much."
 )
-_NARROW, _COLUMN = 50, 17  # characters of the table, and of each recording's column in it
 _SHOWN = {"rad": (1e3, "mrad"), "1": (1e3, "10⁻³")}  # what a parameter is multiplied by, and its unit then
 _SHARES = "f", "aspect", "down", "forward"  # shown in per cent
 
@@ -39,29 +35,23 @@ def calibrate(
     frames: tuple[int, int | None],
     format: str | None,
     quiet: bool,
-    opencv: Path | None,
     overwrite: bool,
 ) -> None:
     """Run recordings of one rig; write and print what they say of it, see `slam.run.calibrating`."""
-
-    def show(sequence: StereoSequence, count: int) -> AbstractContextManager[Callable[[FrameResult], None]]:
-        return progress(count, f"…{sequence.name[-14:]}", quiet)
-
     twice = next((text for k, text in enumerate(texts) if text in texts[:k]), None)
     if twice is not None:
         raise ConfigurationError(f"{twice}: given twice; it would count as two recordings that agree")
     require_settable(settings, SystemConfig().to_json(), "surf")
     with noting_inputs() as inputs:
         opened = [open_sequence(text, format=format) for text in texts]
-    found = run(opened, out, show, settings, frames, inputs, opencv, overwrite)
+    count = sum(frame_count(sequence, *frames) or 0 for sequence in opened)
+    with progress(count, "calibrate", quiet) as tell:
+        found = run(opened, out, settings, frames, inputs, overwrite, tell)
     for warning in found["warnings"]:
         logging.getLogger(__name__).warning("%s", warning)
     if quiet:
         return
     _print(found)
-    if opencv:
-        off = found["opencv_off_px"]
-        print(f"The corrected calibration holds the corrections to {off:.3f} px, and no uncertainty.")
     print(f"Use it: slam run SEQUENCE --calibration {out}" if found["worth_correcting"] else f"File: {out}")
 
 
@@ -72,32 +62,23 @@ def unit_of(row: dict[str, Any], focal: float) -> tuple[float, str]:
 
 
 def _print(found: dict[str, Any]) -> None:
-    """What the recordings say, and the table."""
-    console, apart, recordings = Console(), found["apart"], found["recordings"]
-    if not console.is_terminal:  # a file or a pipe is not 80 columns wide
-        console = Console(width=_NARROW + _COLUMN * (1 + len(recordings)))
-    fits = _NARROW + _COLUMN * len(recordings) <= console.width
-    shown = recordings if fits and len(recordings) > 1 else ()  # of a single one, all is that
-    table = Table(title="corrections: mean ± standard deviation", show_lines=False)
-    table.add_column("parameter")
-    table.add_column("unit")
-    numbers = (f"({number})" for number in range(1, len(shown) + 1))
-    for name in ("all", *numbers, *(["apart"] if apart else []), "usual"):
-        table.add_column(name, justify="right", no_wrap=True)
+    console, apart = Console(), found["apart"]
+    table = empty_table(
+        "corrections: mean ± standard deviation", ["unit", "correction", *(["apart"] if apart else []), "usual"]
+    )
     for k, row in enumerate(found["parameters"]):
         factor, unit = unit_of(row, found["rig"]["focal"])
-        own = [row, *(one["pairs"] and one["parameters"][k] for one in shown)]  # none of what is left out
-        cells = [f"{factor * one['mean']:.2f} ± {factor * one['sigma']:.2f}" if one else "–" for one in own]
-        if apart:
+        cells = [f"{factor * row['mean']:.2f} ± {factor * row['sigma']:.2f}"]
+        if apart:  # by how much the recordings differ
             cells.append(f"{apart[k]:.1f} σ" if np.isfinite(apart[k]) else "–")
         table.add_row(row["name"], unit, *cells, f"± {factor * found['usual'][k]:.2g}")
     for text in filter(None, (found["judgement"], found["agreement"])):
         console.print(text, markup=False, highlight=False)
     console.print(table)
     console.print(_SIGN, highlight=False)
-    for number, one in enumerate(recordings, 1):
+    for one in found["recordings"]:
         pairs, unsolved = one["pairs"], one["unsolved_pairs"]
         tells = f"{pairs} pairs of views" if pairs else "no pair of views that shows motion: left out"
         if unsolved:
             tells += f"; in {unsolved} others too few features agree on one motion of the camera"
-        console.print(f"({number}) {one['sequence']}: {one['frames']} frames, {tells}", markup=False)
+        console.print(f"{one['sequence']}: {one['frames']} frames, {tells}", markup=False)

@@ -79,7 +79,6 @@ def main() -> None:
 
 
 def _print_version(wanted: bool) -> None:
-    """What ``--version`` prints."""
     if wanted:
         from slam.version import __version__
 
@@ -127,8 +126,7 @@ def run_command(
     calibration: Annotated[_File, option("The rig's errors, from `slam calibrate` or a run.", "FILE")] = None,
     mask: _Mask = None,
     viewer: Annotated[_Text, option("Show it in Rerun, or keep it for Rerun.", "live|FILE.rrd")] = None,
-    draw: Annotated[_File, option("Draw landmarks and objects into the frames.", "DIR|FILE.mp4")] = None,
-    draw_map: Annotated[bool, option("With --draw: the growing map beside each frame.", None, "--draw-map")] = False,
+    draw: Annotated[_File, option("Draw landmarks and objects, and the map that grows.", "DIR|FILE.mp4")] = None,
     live: Annotated[bool, option("Frames at their own rate; late ones are dropped.", None, "--live")] = False,
     picture: _Picture = True,
     overwrite: _Overwrite = False,
@@ -137,7 +135,6 @@ def run_command(
     """Run one sequence through one back end."""
     from slam.commands.display import progress
     from slam.commands.run import finish, frame_count, prepare, run_folder, title
-    from slam.errors import ConfigurationError
     from slam.files import noting_inputs
     from slam.outputs import require_outputs
     from slam.run import drawing
@@ -147,8 +144,6 @@ def run_command(
     from slam.run.warm_up import compile_kernels
     from slam.sequences import is_live, with_mask
 
-    if draw_map and draw is None:
-        raise ConfigurationError("--draw-map draws beside the frames: give --draw FILE.mp4, or a folder, too")
     with noting_inputs() as inputs:
         opened, options = prepare(
             with_mask(sequence, mask), settings or (), frames, backend=backend, frontend=frontend, kind=kind,
@@ -169,7 +164,7 @@ def run_command(
         if viewer is not None:
             watches.append(stack.enter_context(viewing.Viewer(viewer, opened.rig, opened.ground_truth)).show)
         if draw is not None:
-            watches.append(stack.enter_context(drawing.FramePictures(draw, draw_map)).show)
+            watches.append(stack.enter_context(drawing.FramePictures(draw)).show)
         until = threading.Event() if live or is_live(opened) else None
         if until is not None and not quiet:
             what = "are taken until" if is_live(opened) else "come at their own rate, to the last one or until"
@@ -250,7 +245,7 @@ def compare_command(
     overwrite: _Overwrite = False,
     quiet: Annotated[bool, option("No progress, no conclusions.", None, "--quiet", "-q")] = False,
 ) -> None:
-    """Compare back ends on the same recordings: tables, what is certain and what is not, and one HTML report."""
+    """Compare back ends on the same recordings: tables, what can be told from chance, and one HTML report."""
     from slam.commands import compare as command
     from slam.commands.run import command_line
     from slam.compare.plan import Plan
@@ -267,7 +262,6 @@ def compare_command(
 def calibrate_command(
     sequences: Annotated[list[str], argument("Recordings of one rig.", "SEQUENCE")],
     out: Annotated[Path, option("For `slam run --calibration`.", "FILE", "--out", "-o")] = Path("rig_errors.json"),
-    opencv: Annotated[_File, option("The corrected calibration in OpenCV's form.", "FILE.yaml")] = None,
     settings: _Set = None,
     frames: _Frames = None,
     format: _Format = None,
@@ -281,7 +275,7 @@ def calibrate_command(
     from slam.sequences import with_mask
 
     texts = [with_mask(text, mask) for text in sequences]
-    calibrate(texts, out, settings or [], parse_frames(frames), format, quiet, opencv, overwrite)
+    calibrate(texts, out, settings or [], parse_frames(frames), format, quiet, overwrite)
 
 
 @app.command("render", short_help="Write a built-in sequence as a folder.")
@@ -308,18 +302,6 @@ def render_command(
         root = write_euroc(opened, out, start, stop, tell)
     if not quiet:
         print(f"Files: {root}")
-
-
-@app.command("view", short_help="Show a finished run in Rerun.")
-def view_command(
-    folder: Annotated[Path, argument("Left by `slam run`.", "DIR")],
-    target: Annotated[str, option("A window, or a file.", "live|FILE.rrd", "--to")] = "live",
-    overwrite: _Overwrite = False,
-) -> None:
-    """Show a finished run in Rerun: path, objects and map; `slam run --viewer` shows its images, too."""
-    from slam.run.viewer import view_run
-
-    view_run(folder, target, overwrite)
 
 
 @app.command("list", short_help="List back ends, sequences and formats.")

@@ -8,20 +8,18 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from slam import registry
-from slam.compare.plan import CLOSED_LOOP, SIMULATED, Plan, Trial, is_world
+from slam.compare.plan import CLOSED_LOOP, Plan, Trial, is_world
 from slam.compare.report import write_report
 from slam.compare.sweep import Run, check, is_done, run_jobs, sweep
 from slam.compare.tables import caution, groups, write_tables
 from slam.compare.trial import COMPLETED, RESULT
 from slam.config import SystemConfig
-from slam.errors import ConfigurationError, UnknownNameError
+from slam.errors import ConfigurationError
 from slam.files import read_object
-from slam.naming import unknown
 from slam.runtime.threads import available_cores
-from slam.sequences.base import said_before
 from slam.settings import require_settable
 
-_MOST_WORKERS = 1024
+_NAMED = 3  # failed runs whose reasons are printed; the report has all
 _TRIED = 15  # frames by which the time of a comparison is told
 
 
@@ -48,10 +46,15 @@ def compare(
     """
     from slam.commands.display import counting, print_conclusions
 
-    _require_names(plan)
+    for text in plan.sequences:
+        if text in registry.names("backends") and not Path(text).exists():
+            names = ",".join([*plan.backends, text])
+            hint = f"a back end, no sequence; several are joined by commas: --backends {names}"
+            raise ConfigurationError(f"{text}: {hint}")
+    require_settable(plan.settings, SystemConfig().to_json(), plan.frontend)
     count = available_cores() if workers is None else workers
-    if not 1 <= count <= _MOST_WORKERS:
-        raise ConfigurationError(f"comparison: workers must be from 1 to {_MOST_WORKERS}, got {count}")
+    if count < 1:
+        raise ConfigurationError(f"comparison: workers must be 1 or more, got {count}")
     frames = check(plan, out, overwrite)  # before there is a progress bar
     total, done = sum(frames[trial.sequence] for trial in plan.every), 0
     limits = caution(plan, plan.trials if any(map(is_world, plan.sequences)) else 1)
@@ -62,7 +65,7 @@ def compare(
         about = "" if seconds is None else f": about {seconds / min(count, len(left)):.0f} s, by the first frames"
         print(f"{len(plan.every)} runs{before}, {total} frames in all, {count} at a time{about}")
         print(limits, flush=True)
-    with said_before(), counting(total, "frames", quiet) as tell:  # `check` has said what opening says
+    with counting(total, "frames", quiet) as tell:
 
         def ended(trial: Trial) -> None:
             nonlocal done
@@ -75,21 +78,11 @@ def compare(
     report = write_report(plan, every, runs, out, limits, command)
     if not quiet:
         print_conclusions(every)
-        print(f"{len(runs)} runs, {sum(not run.completed for run in runs)} failed. Report: {report}")
+        failed = [run for run in runs if not run.completed]
+        for run in failed[:_NAMED]:
+            print(f"{run.trial.backend}, seed {run.trial.seed}: {run.outcome}")
+        print(f"Runs: {len(runs)}, {len(failed)} failed. Report: {report}")
     return runs
-
-
-def _require_names(plan: Plan) -> None:
-    """Raise where there is no such front end, a setting cannot be set, or a back end is given as a sequence."""
-    known = [*registry.names("frontends"), SIMULATED]
-    if plan.frontend not in known and ":" not in plan.frontend:
-        raise UnknownNameError(f"{unknown('front end', plan.frontend, known)}; or one of your own: module:Class")
-    require_settable(plan.settings, SystemConfig().to_json(), plan.frontend)
-    for text in plan.sequences:
-        if text in registry.names("backends") and not Path(text).exists():
-            names = ",".join([*plan.backends, text])
-            hint = f"a back end, no sequence; several are joined by commas: --backends {names}"
-            raise ConfigurationError(f"{text}: {hint}")
 
 
 def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
@@ -97,7 +90,7 @@ def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
     seconds, tried = 0.0, dict[str, dict[str, float]]()
     for trial in left:
         if trial.sequence not in tried:
-            with said_before(), TemporaryDirectory(prefix="slam_trial_") as folder:
+            with TemporaryDirectory(prefix="slam_trial_") as folder:
                 stop = trial.start + min(_TRIED, frames[trial.sequence])
                 first = replace(trial, seed=0, mode=CLOSED_LOOP, stop=stop)
                 run_jobs([(first, Path(folder), None)], 1, lambda trial: None)

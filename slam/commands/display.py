@@ -40,23 +40,26 @@ def progress(total: int | None, title: str, quiet: bool = False) -> Iterator[Cal
     While kernels are compiled the line says so, and how many are done.
     """
     bar = _bar(TextColumn("{task.fields[status]}"), quiet=quiet, get_time=working_time)
-    task = bar.add_task(title, total=total, status="", visible=False)
+    task, last = bar.add_task(title, total=total, status="", visible=False), ""
 
     def compiling(done: int, of: int) -> None:
         bar.start()
         bar.update(task, status=f"compiling {done}/{of}, once", visible=True)
 
     def frame(result: FrameResult) -> None:
+        nonlocal last
         bar.start()
         speed = bar.tasks[task].speed
         said = f"{result.status.value} {len(result.report.used)}/{result.map_size}"  # landmarks used, known
-        bar.update(task, advance=1, status=f"{speed:.1f} Hz {said}" if speed else said, visible=True)
+        last = f"{speed:.1f} Hz {said}" if speed else said
+        bar.update(task, advance=1, status=last, visible=True)
 
     compile_clock.watch = compiling
     try:
         yield frame
     finally:
         compile_clock.watch = None
+        bar.update(task, status=last)  # kernels may have been compiled after it
         if bar.live.is_started:
             bar.stop()
 
@@ -77,7 +80,7 @@ def print_conclusions(every: Sequence[Group]) -> None:
         _say(f"\n{group.name}", "bold")
         for text in tables.sentences(group):
             _say(text)
-        table = _table("", group.runs)
+        table = empty_table("", group.runs)
         for metric in group.metrics:
             if not metric.main:
                 continue
@@ -90,7 +93,7 @@ def print_conclusions(every: Sequence[Group]) -> None:
             _say(text)
 
 
-def _table(title: str, names: Iterable[str]) -> Table:
+def empty_table(title: str, names: Iterable[str]) -> Table:
     """An empty table with a column for each name."""
     table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("")
@@ -105,7 +108,7 @@ def _say(text: str, style: str | None = None) -> None:
 
 def print_summary(summaries: list[dict[str, Any]], files: Sequence[Path]) -> None:
     """A table of finished runs, a column each, whether their covariances hold, and what was written."""
-    table = _table(summaries[0]["sequence"], (summary["backend"] for summary in summaries))
+    table = empty_table(summaries[0]["sequence"], (summary["backend"] for summary in summaries))
     for label, values in rows(summaries):
         table.add_row(escape(label), *values)
     _console.print(table)
@@ -138,4 +141,4 @@ def print_listing(options: bool = False) -> None:
         table.add_row(f"synthetic:{name}", escape(worlds.describe(name).splitlines()[0].partition(": ")[2]))
     table.add_row("[bold]formats[/]", ", ".join(formats()))
     _console.print(table, highlight=False)
-    _say("`slam list --options` shows the options of each built-in sequence, `slam settings NAME` those of the others.")
+    _say("`slam list --options` shows the options of built-in sequences, `slam settings NAME` of back and front ends.")

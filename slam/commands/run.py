@@ -31,7 +31,7 @@ _LONGEST = 60  # characters of a sequence's name in a folder's
 
 
 def prepare(
-    source: str, settings: Sequence[str] = (), frames: str | None = None, **choices: Any
+    source: str, settings: Sequence[str] = (), frames: str | None = None, format: str | None = None, **choices: Any
 ) -> tuple[StereoSequence, RunOptions]:
     """The sequence, opened, and what to do with it; the folder is still to be chosen.
 
@@ -39,8 +39,8 @@ def prepare(
     input.
     """
     said = {name: value for name, value in choices.items() if value}
-    options = replace(RunOptions(_BACKEND, _FRONTEND, SystemConfig(), source=source), **said)
-    opened = open_sequence(source, format=options.format)
+    options = replace(RunOptions(_BACKEND, _FRONTEND, SystemConfig()), **said)
+    opened = open_sequence(source, format=format)
     if options.mono and options.prior_map is None:
         raise ConfigurationError("--mono needs --map FILE: left images alone do not tell how large the world is")
     kind = options.kind or opened.kind

@@ -14,8 +14,6 @@ SYNTHETIC = "synthetic:"
 #: Measurements straight from a world's landmarks in place of a front end's: no image is made.
 SIMULATED = "simulated"
 
-_MOST_TRIALS = 100_000
-
 CLOSED_LOOP, REPLAY = "closed loop", "replay"
 
 
@@ -52,8 +50,8 @@ class Plan:
             twice = next((name for name in every if every.count(name) > 1), None)
             if twice is not None:
                 raise ConfigurationError(f"comparison: {what} {twice!r} is given twice")
-        if not 1 <= self.trials <= _MOST_TRIALS:
-            raise ConfigurationError(f"comparison: trials must be from 1 to {_MOST_TRIALS}, got {self.trials}")
+        if self.trials < 1:
+            raise ConfigurationError(f"comparison: trials must be 1 or more, got {self.trials}")
         for sequence in self.sequences:
             if sequence.startswith("camera:"):
                 raise ConfigurationError(f"{sequence}: a camera gives each back end other frames; compare recordings")

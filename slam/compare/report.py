@@ -19,7 +19,6 @@ from slam.files import read_object, write_text
 from slam.run.plots import backend_colours, drawn
 from slam.run.results import BY_KEY
 from slam.run.run_data import RunData
-from slam.run.schema import STAGE_NAMES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,8 +39,6 @@ def write_report(
     """
     from jinja2 import Environment, FileSystemLoader
 
-    timed = {stage for run in runs for stage in run.milliseconds}
-    stages = {"total": "whole frame"} | {stage: name for stage, name in STAGE_NAMES.items() if stage in timed}
     environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True)
     modes = [every[at : at + len(plan.modes)] for at in range(0, len(every), len(plan.modes))]  # of a section
     text = environment.get_template("report.html.j2").render(
@@ -53,8 +50,7 @@ def write_report(
         caution=caution,
         level=round(100 * LEVEL),
         sections=[(own, list(_pictures(own[0]))) for own in modes],
-        stages=stages.values(),
-        times=[_times(group, backend, stages) for group in every for backend in group.runs],
+        times=[(group.name, *map(_time, group.runs.values())) for group in every],
         command=command,
         versions=read_object(out / SWEEP)["versions"],
     )
@@ -62,11 +58,9 @@ def write_report(
     return out / "report.html"
 
 
-def _times(group: Group, backend: str, stages: dict[str, str]) -> tuple[str, ...]:
-    """A row of medians."""
-    own = group.runs[backend]
-    values = ([run.milliseconds[stage] for run in own if stage in run.milliseconds] for stage in stages)
-    return (group.name, backend, *(f"{np.median(each):.2f}" if each else "–" for each in values))
+def _time(runs: Sequence[Run]) -> str:
+    known = [run.milliseconds["total"] for run in runs if run.milliseconds]
+    return f"{np.median(known):.1f}" if known else "–"
 
 
 def _pictures(group: Group) -> Iterator[tuple[str, str]]:
@@ -105,7 +99,7 @@ def _pairs(group: Group) -> Figure:
     for at, value, name, colour in zip(x, values, group.runs, backend_colours(list(group.runs))):
         axis.plot(at, value, "o", color=colour, ms=4, alpha=0.8, label=name)
     axis.set(xlim=(-0.5, trials - 0.5), xticks=range(0, trials, -(-trials // _MOST_TICKS)))
-    axis.set(xlabel="seed", ylabel=metric.title, ylim=(0, None))
+    axis.set(xlabel="seed", ylabel=f"online ATE [{metric.unit}]", ylim=(0, 1.08 * np.nanmax(values, initial=1e-9)))
     axis.spines[["top", "right"]].set_visible(False)
     axis.legend(frameon=False, fontsize=8, ncols=3, loc="lower left", bbox_to_anchor=(0, 1.0))  # where it hides nothing
     return figure

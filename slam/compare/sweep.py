@@ -13,7 +13,6 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -24,10 +23,9 @@ from slam.errors import SlamError
 from slam.files import noting_inputs, read_object
 from slam.input.features import Rectification
 from slam.outputs import Output, require_outputs
-from slam.run.options import changed_versions, versions
+from slam.run.options import versions
 from slam.run.outputs import naming_folder, write_json
 from slam.sequences import open_sequence
-from slam.sequences.base import said_before
 
 RUNS, SWEEP = "runs", "sweep.json"
 
@@ -69,7 +67,7 @@ def sweep(
         SlamError: a sequence, name or setting is bad (nothing is run then), the folder holds something else, or a
             worker process ended.
     """
-    check(plan, out, overwrite)
+    check(plan, out, overwrite, quiet=True)
     told = on_done or (lambda trial: None)
     with naming_folder(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -134,18 +132,18 @@ def _begin_worker() -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
 
 
-def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
+def check(plan: Plan, out: Path, overwrite: bool = False, quiet: bool = False) -> dict[str, int]:
     """Try every sequence, front end, back end and setting once, and whether the files can be written.
 
-    Returns the number of frames of a run, by sequence. Raises SlamError where something cannot work.
+    Returns the number of frames of a run, by sequence. What is wrong with a recording is logged unless `quiet`. Raises
+    SlamError where something cannot work.
     """
     frames: dict[str, int] = {}
     with noting_inputs() as inputs:
         for trial in plan.trials_of(CLOSED_LOOP):
             if trial.seed:
                 continue
-            with said_before() if trial.sequence in frames else nullcontext():
-                sequence = open_sequence(trial.source)
+            sequence = open_sequence(trial.source, quiet=quiet or trial.sequence in frames)
             frames[trial.sequence] = len(range(len(sequence))[trial.start : trial.stop])
             config = config_of(trial, sequence)
             if plan.frontend != SIMULATED:
@@ -159,8 +157,9 @@ def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
         before, trials = held.get("versions"), held.get("trials")
         if not isinstance(before, dict) or not isinstance(trials, list):
             raise SlamError(f"{out / SWEEP}: not that of a comparison")
-        if changed := changed_versions(dict.fromkeys(versions(), "unknown") | before, versions()):
-            raise SlamError(f"{out}: begun with {changed[0]}: runs cannot be compared; give another --out")
+        for name, now in versions().items():
+            if (then := before.get(name, "unknown")) != now:
+                raise SlamError(f"{out}: begun with {name} {then}, not {now}; give another --out")
         if not set(map(json.dumps, trials)) <= {json.dumps(asdict(trial)) for trial in plan.every}:
             raise SlamError(f"{out}: holds a comparison of more or other runs; give another --out, or --overwrite")
     require_outputs([Output(out, "--out", NAMES)], inputs, overwrite or goes_on)

@@ -17,13 +17,14 @@ from slam.compare.statistics import Difference, difference, reach
 from slam.compare.sweep import Run
 from slam.files import write_text
 from slam.geometry.se3 import Array
-from slam.run.outputs import csv_rows
+from slam.run.outputs import csv_number, csv_rows
 from slam.run.results import COMPARED, DOUBTED, Metric, number, verdict
 
 DIFFERENCE_COLUMNS = (
     "sequence", "mode", "figure", "reference", "other", "pairs", "missing", "mean_reference", "mean_other",
     "difference", "low", "high", "verdict",
 )  # fmt: skip
+_HARDLY, _FEW = 5.0, 8  # times the scatter that no estimators differ by; trials that show less with three back ends
 RUN_COLUMNS = ("sequence", "mode", "seed", "backend", "outcome")
 
 
@@ -88,7 +89,7 @@ def write_tables(every: Sequence[Group], runs: Sequence[Run], out: Path) -> None
     """Write runs.csv and differences.csv; times, in which no two runs agree, are in each run's ``summary.json``."""
     lines: list[tuple[object, ...]] = [(*RUN_COLUMNS, *(metric.key for metric in COMPARED))]
     for run in runs:
-        t, values = run.trial, (_number(run.metrics.get(metric.key, np.nan)) for metric in COMPARED)
+        t, values = run.trial, (csv_number(run.metrics.get(metric.key, np.nan)) for metric in COMPARED)
         lines.append((t.sequence, t.mode, t.seed, t.backend, run.outcome, *values))
     write_text(out / "runs.csv", csv_rows(lines))
     lines = [DIFFERENCE_COLUMNS]
@@ -96,13 +97,8 @@ def write_tables(every: Sequence[Group], runs: Sequence[Run], out: Path) -> None
         for key, compared in group.compared.items():
             for other, d in compared.items():
                 head = group.sequence, group.mode, key, next(iter(group.runs)), other, d.pairs, d.missing
-                lines.append((*head, *map(_number, (d.reference, d.other, d.mean, d.low, d.high)), d.verdict))
+                lines.append((*head, *map(csv_number, (d.reference, d.other, d.mean, d.low, d.high)), d.verdict))
     write_text(out / "differences.csv", csv_rows(lines))
-
-
-def _number(value: float) -> str:
-    """A number for a CSV cell; empty where there is none."""
-    return f"{value:.9g}" if np.isfinite(value) else ""
 
 
 def row(group: Group, metric: Metric) -> list[dict[str, str]]:
@@ -167,7 +163,10 @@ def caution(plan: Plan, trials: int) -> str:
         return ""
     if trials == 1:
         return "One trial cannot tell a difference from chance; a recorded sequence has no more, worlds have --trials."
-    return f"{trials} trials show a difference of {reach(trials, tests):.2g} times its scatter from trial to trial."
+    if (least := reach(trials, tests)) > _HARDLY:
+        return f"{trials} trials can hardly show any difference; take --trials {_FEW} or more."
+    scatter = f"{least:.2g} times its scatter from trial to trial"
+    return f"With {trials} trials only a difference of {scatter} can be told from chance."
 
 
 def measurements(mode: str, reference: str) -> str:

@@ -26,7 +26,6 @@ from slam.run.run_data import RunData
 from slam.run.runner import run, run_recording
 from slam.run.summary import RunRecord
 from slam.sequences import Sequence, open_sequence
-from slam.sequences.base import said_before
 from slam.worlds import WorldSequence
 
 RESULT, RECORDING = "result.json", "recording.npz"
@@ -114,8 +113,7 @@ def _run(trial: Trial, recording: Path | None, out: Path) -> tuple[dict[str, flo
     closed, record = trial.mode == CLOSED_LOOP, RunRecord()
     if not closed and recording is None:
         raise SlamError(f"{trial.source}: the run to be replayed has failed, there are no measurements")
-    with said_before():
-        sequence = open_sequence(trial.source)
+    sequence = open_sequence(trial.source, quiet=True)  # `slam.compare.sweep.check` has said what it says
     collected = MapRecord(sequence, trial.start, closed)
     config = config_of(trial, sequence)
     options = RunOptions(trial.backend, trial.frontend, config, out, kind=sequence.kind)

@@ -32,6 +32,9 @@ STRETCHES = (1.0, 10.0, 100.0)
 #: Beside the figures: the cameras are those of the calibration, while the covariances count errors of one.
 EXACT = "exact calibration"
 
+#: The same, where the back end's covariances count no errors of the calibration, as others' do.
+PIXELS_ALONE = "pixel noise alone"
+
 _DOF = 6
 _SMALLEST = 1e-12  # eigenvalue of a covariance [rad², m²] below which it is none
 _ROUNDING = 1e-14  # eigenvalues below this share of the largest are rounding
@@ -48,15 +51,19 @@ def consistency_figures(
 
     Returns:
         "mean NEES" from the start, "NEES over L m" for each of `STRETCHES`; six is right for all of these, and "band
-        low" and "band high" hold 95 % of runs; "doubtful truth over L m" and "no covariance over L m", the shares of
-        stretches left out because the truth contradicts itself or an old place was measured again within them, where
-        there are any.
+        low" and "band high" hold 95 % of runs; the same with ", truth exact", as if a truth with errors had none;
+        "doubtful truth over L m" and "no covariance over L m", the shares of stretches left out because the truth
+        contradicts itself or an old place was measured again within them, where there are any.
     """
     start = int(np.argmin(interpolated(true, noise)))  # the first pose that was measured
     later = np.arange(start + 1, len(own))
     from_start = stretch_nees(own, true, covariances, noise, np.full(len(later), start), later, common)
     low, high = chi_square_band(_DOF)  # of one value: errors of the rig make all frames of a run as good as one
     figures = {"mean NEES": _mean(from_start), "band low": low, "band high": high, "dof": float(_DOF)}
+    exact, noisy = TruthNoise(), noise != TruthNoise()
+    if noisy:
+        of_exact = stretch_nees(own, true, covariances, exact, np.full(len(later), start), later, common)
+        figures["mean NEES, truth exact"] = _mean(of_exact[np.isfinite(from_start)])
     closed = _closings(covariances)
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(true.positions, axis=0), axis=1).cumsum()])
     for length in STRETCHES:
@@ -66,6 +73,9 @@ def consistency_figures(
         values[closed[starts] != closed[last[starts]]] = np.nan
         if np.isfinite(values).any():
             figures[f"NEES over {length:g} m"] = _mean(values)
+            if noisy:
+                of_exact = stretch_nees(own, true, covariances, exact, starts, last[starts], common)
+                figures[f"NEES over {length:g} m, truth exact"] = _mean(of_exact[np.isfinite(values)])
         left_out = doubtful(true, noise, starts, last[starts])
         none = ~np.isfinite(values) & ~left_out
         for what, rows in (("doubtful truth", left_out), ("no covariance", none)):
@@ -106,7 +116,7 @@ def stretch_nees(
     values = np.full(len(first), np.nan)
     if usable.any():
         N, A, G = N[usable], A[usable], G[usable]
-        J = _by_mounting(true, noise, first[usable], last[usable], A)
+        J = by_mounting(true, noise, first[usable], last[usable], A)
         errors = _remounted(np.concatenate([residuals[usable, :, None], G], axis=2), J, _with(N, G))
         values[usable] = nees(errors[:, :, 0], _with(N, errors[:, :, 1:]))
     return values
@@ -125,7 +135,7 @@ def _with(N: Array, G: Array) -> Array:
     return np.asarray(N + G @ np.swapaxes(G, 1, 2))
 
 
-def _by_mounting(true: Trajectory, noise: TruthNoise, first: RowArray, last: RowArray, A: Array) -> Array:
+def by_mounting(true: Trajectory, noise: TruthNoise, first: RowArray, last: RowArray, A: Array) -> Array:
     """Derivatives (M, 6, 7) of relative poses by how the truth's sensor is mounted and by its clock, of unit variance.
 
     With ``T_true = T exp(w)`` for all poses, w = [mounting, lever], a relative pose is off by ``(1 − A) w``; with a

@@ -90,6 +90,8 @@ def _span(name: str, stamps: Array) -> str:
 def absolute_errors(estimate: Trajectory, truth: Trajectory) -> PathErrors:
     """ATE of two paths of equal length, row by row (see `associate`), after their alignment without scale.
 
+    Positions alone align them, so errors of the rotation mean little where the camera stood or went straight.
+
     Raises:
         TrajectoryError: the lengths differ, or there is no pose.
     """
@@ -149,7 +151,6 @@ def _require_pairs(estimate: Trajectory, truth: Trajectory, count: int) -> None:
 
 
 def _motion_errors(estimate: Trajectory, truth: Trajectory, first: np.ndarray, last: np.ndarray) -> PathErrors:
-    """Of the motions between rows `first` and `last`."""
     true = inverse(truth.poses[first]) @ truth.poses[last]
     estimated = inverse(estimate.poses[first]) @ estimate.poses[last]
     return error_sizes(inverse(true) @ estimated)

@@ -79,12 +79,12 @@ class ObjectScore:
     """Gathers a run's results frame by frame and sums them up.
 
     `bodies` are true poses ``T_world_object`` (B, N, 4, 4) by frame, in the truth's world, ids from 1; `cameras` those
-    of the left camera (N, 4, 4). A body's image moves by `pixel` [px] before it can be said to move.
+    of the left camera (N, 4, 4).
     """
 
-    def __init__(self, bodies: Array, stamps: Array, cameras: Array, focal: float, pixel: float = 1.0) -> None:
+    def __init__(self, bodies: Array, stamps: Array, cameras: Array, focal: float) -> None:
         self.bodies, self.cameras, self.stamps = bodies, cameras, stamps
-        self.moves_from = [_first_motion(poses, cameras, focal, pixel) for poses in bodies]
+        self.moves_from = [_first_motion(poses, cameras, focal) for poses in bodies]
         self.lives: defaultdict[int, _Life] = defaultdict(_Life)
         self._count: Counter[str] = Counter()  # of features and frames
         self._covered: defaultdict[int, list[bool]] = defaultdict(list)
@@ -190,8 +190,8 @@ class ObjectScore:
         return np.concatenate(values)
 
 
-def _first_motion(poses: Array, cameras: Array, focal: float, pixel: float) -> int:
-    """First frame in which a body's place differs by more than `pixel` from where it was in the first, as seen then.
+def _first_motion(poses: Array, cameras: Array, focal: float) -> int:
+    """First frame in which a body's place differs by more than a pixel from where it was in the first, as seen then.
 
     Its origin and points 0.1 m off it along its axes are looked at. The number of frames where it never does.
     """
@@ -199,7 +199,7 @@ def _first_motion(poses: Array, cameras: Array, focal: float, pixel: float) -> i
     world = np.einsum("nij,mj->nmi", poses[:, :3, :3], marks) + poses[:, None, :3, 3]
     shift = np.linalg.norm(world - world[0], axis=2).max(axis=1)
     distance = np.maximum(np.linalg.norm(poses[:, :3, 3] - cameras[:, :3, 3], axis=1), 0.1)
-    moved = np.flatnonzero(focal * shift / distance > pixel)
+    moved = np.flatnonzero(focal * shift / distance > 1.0)
     return int(moved[0]) if len(moved) else len(poses)
 
 

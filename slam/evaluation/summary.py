@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
@@ -18,16 +18,7 @@ from slam.geometry.trajectory import Trajectory, TruthNoise
 logger = logging.getLogger("slam.evaluation")
 
 
-class WithTruth(Protocol):
-    """What is asked of a sequence or a recording."""
-
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """The left camera's true path; None where it is not known."""
-        ...
-
-
-def evaluate(estimate: Trajectory, sequence: WithTruth) -> dict[str, float]:
+def evaluate(estimate: Trajectory, sequence: Any) -> dict[str, float]:
     """Errors of an estimated path against the sequence's truth; empty where fewer than 3 poses have any.
 
     Figures that cannot be computed for this path, such as those of one that runs off to infinity, are left out.
@@ -39,7 +30,7 @@ def evaluate(estimate: Trajectory, sequence: WithTruth) -> dict[str, float]:
     return _where_possible(_accuracy, *pairs, mounting) | {"poses with truth": float(len(pairs[0]))}
 
 
-def with_truth(estimate: Trajectory, sequence: WithTruth) -> tuple[Trajectory, Trajectory] | None:
+def with_truth(estimate: Trajectory, sequence: Any) -> tuple[Trajectory, Trajectory] | None:
     """Estimated and true path at common stamps; None where fewer than 3 poses have truth."""
     truth = sequence.ground_truth
     if truth is None or not len(estimate):
@@ -100,7 +91,7 @@ def rotation_errors(own: Trajectory, true: Trajectory, mounting: float) -> Array
 
 
 def consistency(
-    estimate: Trajectory, covariances: Array, sequence: WithTruth, common: Sequence[CommonError] | None = None
+    estimate: Trajectory, covariances: Array, sequence: Any, common: Sequence[CommonError] | None = None
 ) -> dict[str, float]:
     """How honest the pose covariances are, see `slam.evaluation.consistency`; empty without truth for the first pose.
 

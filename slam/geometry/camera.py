@@ -200,8 +200,8 @@ def baseline_doubt(baseline: float) -> str:
     if _SHORTEST <= baseline <= _LONGEST:
         return ""
     metres = {unit: baseline * size for unit, size in (("cm", 0.01), ("mm", 0.001))}
-    likely = [f"unit={unit} makes {b:.3g} m" for unit, b in metres.items() if _USUAL[0] <= b <= _USUAL[1]]
-    hint = f" ({', '.join(likely)})" if likely else ""
+    likely = [f"in {unit} it is {b:.3g} m" for unit, b in metres.items() if _USUAL[0] <= b <= _USUAL[1]]
+    hint = f" ({', '.join(likely)}: a recording's option unit=mm; in Python divide T)" if likely else ""
     return f"the cameras are {baseline:g} m apart by their calibration: is it in metres?{hint}"
 
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera, floats, size_doubt
-from slam.geometry.se3 import Array, nearest_rotation
+from slam.geometry.se3 import Array, is_rotation, nearest_rotation
 
 _ZERO_DISPARITY = 1024  # fixed: OpenCV's CALIB_ZERO_DISPARITY, whose module differs between its versions
 MINIMAL_POINTS = 3  #: fixed: points that fix a pose
@@ -57,7 +57,7 @@ class StereoRig:
         R, b = floats("stereo extrinsics", self.R), floats("stereo extrinsics", self.b).reshape(-1)
         if R.shape != (3, 3) or b.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(b).all()):
             raise CalibrationError("stereo extrinsics must be a finite (3, 3) rotation and (3,) translation")
-        if np.abs(R).max() > 1.1 or np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
+        if not is_rotation(R, 1e-4):
             raise CalibrationError("stereo extrinsics: R is not a rotation matrix")
         if np.abs(b).max() > 1e6:  # 1e6: baseline [m]
             raise CalibrationError(f"stereo baseline is impossibly long: {b.tolist()} m")

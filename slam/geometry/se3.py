@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from slam.geometry.arrays import Array as Array
+from slam.geometry.arrays import BoolArray
 
 #: numerics: Variance [rad², m²] that a covariance has at least, or that is added to it, to keep it invertible.
 LEAST_VARIANCE = 1e-12
@@ -85,6 +86,13 @@ def nearest_rotation(M: Array) -> Array:
     """The rotation (D, D), D = 2 or 3, nearest to a matrix in the Frobenius norm (polar decomposition)."""
     U, _, Vt = np.linalg.svd(M)
     return np.asarray(U @ np.diag([*np.ones(len(M) - 1), np.linalg.det(U @ Vt)]) @ Vt)
+
+
+def is_rotation(R: Array, tolerance: float) -> BoolArray:
+    """Which matrices (..., 3, 3) are rotations, to within `tolerance` in the elements of ``R Rᵀ``; none with a NaN."""
+    bounded = np.where((np.abs(R) < 2.0).all(axis=(-2, -1), keepdims=True), R, 0.0)  # else squares overflow
+    off = np.abs(bounded @ np.swapaxes(bounded, -1, -2) - np.eye(3)).max(axis=(-2, -1))
+    return np.asarray((off <= tolerance) & (np.linalg.det(bounded) > 0))
 
 
 def pose(R: Array, t: Array) -> Array:
@@ -171,7 +179,6 @@ def _polynomial(w: list[float], a: float, b: float) -> list[list[float]]:
 
 
 def _quaternion(R: list[list[float]]) -> tuple[float, float, float, float]:
-    """`quaternion` of one rotation."""
     (a, b, c), (d, e, f), (g, h, i) = R
     trace = a + e + i
     largest = max(a, e, i, trace)
@@ -190,7 +197,6 @@ def _quaternion(R: list[list[float]]) -> tuple[float, float, float, float]:
 
 
 def _rotation_vector(R: list[list[float]]) -> tuple[float, float, float]:
-    """`so3_log` of one rotation."""
     x, y, z, w = _quaternion(R)
     sine2 = x * x + y * y + z * z
     sine = math.sqrt(sine2)

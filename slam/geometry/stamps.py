@@ -59,12 +59,6 @@ def pair(left: np.ndarray, right: np.ndarray, tolerance: float) -> IntArray:
     return out
 
 
-def trim(partner: IntArray) -> slice:
-    """The rows between the first and the last that have a partner; empty if none has one."""
-    paired = np.flatnonzero(partner >= 0)
-    return slice(int(paired[0]), int(paired[-1]) + 1) if len(paired) else slice(0, 0)
-
-
 def require_frame(name: str, k: int, length: int) -> int:
     """The number of a frame of the sequence `name` of so many frames; SequenceError where there is no frame k."""
     if not isinstance(k, Integral) or not 0 <= k < length:

@@ -81,6 +81,8 @@ class Trajectory:
             axis = plt.figure(layout="constrained").add_subplot()
         across, up = map("xyz".index, plane) if plane else widest(self.positions)
         axis.plot(self.positions[:, across], self.positions[:, up], **options)
+        if "label" in options:
+            axis.legend()
         axis.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[up]} [m]")
         axis.set_aspect("equal", adjustable="datalim")
         return axis
@@ -228,13 +230,10 @@ class Alignment:
     Attributes:
         R: proper rotation (D, D).
         t: translation (D,) [m].
-        rank: number of directions that the positions determine; a turn about a straight path (rank 1) or of a path
-            that stands still (rank 0) is not determined by them.
     """
 
     R: Array
     t: Array
-    rank: int
 
     def apply(self, positions: Array) -> Array:
         """Aligned positions (N, D)."""
@@ -270,13 +269,13 @@ def align_positions(source: Array, target: Array, orientations: Array | None = N
     signs = np.ones(dimensions)  # the weakest direction is turned round where U Vᵀ is a mirror
     signs[-1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
     if np.sqrt((s**2).mean() * (t**2).mean()) < _STILL or d[0] < _STILL:
-        rank, R = 0, nearest_rotation(guide)
+        R = nearest_rotation(guide)
     else:
+        R = U @ np.diag(signs) @ Vt
         # 1e-12: second singular value by the first, below which positions lie on a line
-        rank, R = int((d > 1e-12 * d[0]).sum()), U @ np.diag(signs) @ Vt
-        if rank == 1 and dimensions == 3:
+        if d[1] <= 1e-12 * d[0] and dimensions == 3:
             R = _turn_about(U[:, 0], R, guide)
-    return Alignment(R, centre_t - R @ centre_s, rank)
+    return Alignment(R, centre_t - R @ centre_s)
 
 
 def align(estimate: Trajectory, truth: Trajectory) -> Alignment:

@@ -267,10 +267,14 @@ def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
             "must numbers be shifted by one?"
         )
     elif found.shown < 1:
+        before = "the images were rectified before, or undistorted, and are again; give the calibration after that"
+        if left.has_distortion or right.has_distortion:
+            cause = f"{before}, or leave the distortion out"
+        else:
+            cause = f"the lenses' distortion is missing in it; or {before}"
         return (
             f"rows of left and right image show {100 * max(found.shown, 0.0):.0f} % of what the calibration's "
-            "rectification does to rows: the images were rectified before, or undistorted, and are again; give the "
-            "calibration after that, or leave the distortion out"
+            f"rectification does to rows: {cause}"
         )
     else:
         cause = "check that the calibration is this camera's, at this size, and that both images are of one moment"

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from slam.calibration import RigModel, RigPosterior
-from slam.calibration.corrected import corrected_rig
 from slam.calibration.posterior import SIGMAS, RigEvidence, factory_prior
 from slam.calibration.saved import CERTAIN, agreement, agreement_in_words, joint_calibration
 from slam.config import SystemConfig
@@ -23,7 +21,6 @@ from slam.run.outputs import write_json
 from slam.runtime.threads import one_blas_thread
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import is_live
-from slam.sequences.rigs import write_opencv
 from slam.system import StereoSlam
 
 _BACKEND, _FRONTEND = "ekf", "surf"  # poses are a first guess alone
@@ -34,29 +31,26 @@ _NO_PAIRS = (
 )
 _AWAY = 50.0  # baselines at which the error of the depth is said
 
-#: Shows the progress of a recording of so many frames: gives what is called after each.
-Show = Callable[[StereoSequence, int], AbstractContextManager[Callable[[FrameResult], None]]]
+OnFrame = Callable[[FrameResult], None]
 
 
 @one_blas_thread
 def calibrate(
     sequences: Sequence[StereoSequence],
     out: Path,
-    show: Show,
     settings: Sequence[str] = (),
     frames: tuple[int, int | None] = (0, None),
     inputs: Sequence[Path] = (),
-    opencv: Path | None = None,
     overwrite: bool = False,
+    on_frame: OnFrame = lambda result: None,
 ) -> dict[str, Any]:
     """Run a range of frames of recordings of one rig; returns what they say of it, which is also written to `out`.
 
     Besides the keys of `slam.calibration.SavedCalibration` it has ``recordings``, what each says alone; ``apart``, by
     how many standard deviations two differ at most in each parameter (null for a single recording); ``usual``, how far
     good calibrations are off in each; ``agreement`` and ``judgement``, how good the calibration was, in words;
-    ``worth_correcting``, whether correcting is expected to help; and ``warnings``. `opencv` is a file for the corrected
-    calibration in that form, which is off by ``opencv_off_px`` (RMS). `inputs` are never replaced. Raises SlamError on
-    bad input, before anything is run.
+    ``worth_correcting``, whether correcting is expected to help; and ``warnings``. `inputs` are never replaced. Raises
+    SlamError on bad input, before anything is run.
     """
     rig = sequences[0].rig
     for sequence in sequences:
@@ -64,19 +58,17 @@ def calibrate(
             raise ConfigurationError(f"{sequence.name}: a recording is needed, not a camera")
         if difference := rig_difference(rig_numbers(rig), rig_numbers(sequence.rig)):
             raise CalibrationError(f"{sequence.name}: not the rig of {sequences[0].name}: {difference}")
-    files = ((out, "--out"), (opencv, "--opencv"))
-    require_outputs([Output(file, option) for file, option in files if file is not None], inputs, overwrite)
+    require_outputs([Output(out, "--out")], inputs, overwrite)
     configs = [
         SystemConfig.for_kind(sequence.kind, _FRONTEND).with_settings(["objects.mode=off", *settings])
         for sequence in sequences
     ]
     if not all(config.self_calibration.enabled for config in configs):
         raise ConfigurationError("slam calibrate needs self_calibration.enabled=true")
-    recordings, evidence = zip(*(_run(*each, frames, show) for each in zip(sequences, configs)))
+    recordings, evidence = zip(*(_run(*each, frames, on_frame) for each in zip(sequences, configs)))
     model, known = RigModel(rig), [one for one in evidence if one is not None]
     kept = joint_calibration(model, factory_prior(model), known)
     apart = agreement(model, known)
-    corrected = corrected_rig(model, kept.posterior.mean)
     pairs, unsolved = (sum(one[key] for one in recordings) for key in ("pairs", "unsolved_pairs"))
     warning, judgement, worth = "" if pairs else _NO_PAIRS, "", False
     doubt = next((f"{one['sequence']}: {one['doubt']}" for one in recordings if one["doubt"]), "")
@@ -97,25 +89,24 @@ def calibrate(
         "agreement": None if apart is None else agreement_in_words(apart),
         "judgement": judgement,
         "worth_correcting": worth,
-        "opencv_off_px": float(np.hypot(corrected.left_off, corrected.right_off)),
         "warnings": [warning] if warning else [],
     }
     write_json(out, found)
-    if opencv is not None:
-        write_opencv(opencv, corrected.rig)
     return found
 
 
 def _run(
-    sequence: StereoSequence, config: SystemConfig, frames: tuple[int, int | None], show: Show
+    sequence: StereoSequence,
+    config: SystemConfig,
+    frames: tuple[int, int | None],
+    on_frame: Callable[[FrameResult], None],
 ) -> tuple[dict[str, Any], RigEvidence | None]:
     """What one recording says alone, and its evidence without any prior; None where no motion was seen."""
     system = StereoSlam(sequence.rig, _FRONTEND, _BACKEND, config=config)
     matched = []
-    with show(sequence, len(range(len(sequence))[slice(*frames)])) as on_frame:
-        for _, result in system.run(sequence.frames(*frames)):
-            on_frame(result)
-            matched.append(len(result.matched))
+    for _, result in system.run(sequence.frames(*frames)):
+        on_frame(result)
+        matched.append(len(result.matched))
     own = system.calibration
     found = {
         "sequence": sequence.name,
@@ -161,7 +152,7 @@ def _judged(
     else:
         worth, word = True, f"This is bad: calibrate anew. The noise of one feature is {noise:g} px."
     text = (
-        f"By this the calibration is off by {off[0]:.2f} ± {sigma[0]:.2f} px in disparity and {off[1]:.2f} ± "
+        f"The calibration is off by {off[0]:.2f} ± {sigma[0]:.2f} px in disparity and {off[1]:.2f} ± "
         f"{sigma[1]:.2f} px in rows (RMS over the image), so that at {_AWAY:g} baselines depths are "
         f"{100 * off[0] * _AWAY / model.focal:.1f} % wrong. {word}"
     )

@@ -40,7 +40,6 @@ _REACH = 2.5  # widths of the map in distances of the first landmarks
 
 
 def _bgr(body: int) -> tuple[int, int, int]:
-    """The colour of a moving body, by its id."""
     red, green, blue = body_colour(body)
     return blue, green, red
 
@@ -209,14 +208,14 @@ def output(path: Path) -> Output:
 class FramePictures(ExitStack):
     """Writes pictures of frames to a folder of PNG files, or to a video where the path ends in ``.mp4``.
 
-    The video's rate is that of the first two frames; a single picture is shown for a second. With a map, that grows
-    beside each frame, as wide as the frame is high. Raises SlamError where a video cannot be written.
+    Beside each frame is the map so far, as wide as the frame is high. The video's rate is that of the first two frames;
+    a single picture is shown for a second. Raises SlamError where a video cannot be written.
     """
 
-    def __init__(self, path: Path, with_map: bool = False) -> None:
+    def __init__(self, path: Path) -> None:
         super().__init__()
         self.path, self._film = path, path.suffix.lower() == _FILM
-        self._map = GrowingMap() if with_map else None
+        self._map = GrowingMap()
         self._first: tuple[float, np.ndarray] | None = None  # stamp and picture that wait for the video's rate
         self._video: Any = None
         if path.suffix and not self._film:
@@ -230,11 +229,10 @@ class FramePictures(ExitStack):
     def show(self, frame: StereoFrame, result: FrameResult, system: Any) -> None:
         """Append a step's picture; a `slam.run.runner.Watch`."""
         image = draw_objects(frame.left, result, system.rig)
-        picture = with_legend(image, result.objects)
-        if self._map is not None:
-            estimate = system.estimate()
-            self._map.add(estimate)
-            picture = np.hstack([picture, _above(self._map.draw(estimate, result, len(image)), _IN_MAP)])
+        estimate = system.estimate()
+        self._map.add(estimate)
+        growing = _above(self._map.draw(estimate, result, len(image)), _IN_MAP)
+        picture = np.hstack([with_legend(image, result.objects), growing])
         if not self._film:
             file = self.path / f"{frame.index:0{_DIGITS}d}.png"
             with naming_folder(file):
@@ -247,7 +245,6 @@ class FramePictures(ExitStack):
             self._video.write(picture)
 
     def _open(self, rate: float) -> None:
-        """Begin the video with the first picture."""
         import cv2
 
         assert self._first is not None

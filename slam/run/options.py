@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import platform
-from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -18,7 +16,6 @@ from slam.outputs import Output
 from slam.run.outputs import NAMES
 
 _MOST_FRAMES = 10**12  # of a sequence: more than any has
-_NO_FILES = ("synthetic:", "camera:")
 _PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
 
 
@@ -38,8 +35,6 @@ class RunOptions:
     calibration: Path | None = None  # file with what is known of the rig's error, see `slam.calibration.saved`
     mono: bool = False  # use the left images alone
     live: bool = False  # take frames at their own rate, and leave out those that come too late; of a camera always
-    source: str = ""  # the sequence as `slam.open_sequence` takes it, for ``config.json``; empty where not known
-    format: str | None = None  # of the sequence; None for found out
     kind: str = ""  # of motion that the settings are for; empty where not known
     command: str = ""  # the command line, for ``config.json``
 
@@ -68,27 +63,17 @@ def parse_frames(text: str | None) -> tuple[int, int | None]:
             raise ValueError
         start, stop = int(first or 0), int(last) if last else None
     except ValueError:
-        raise SlamError(f"frames {text!r} is not of the form A:B") from None
+        raise SlamError(f"frames {text!r} is not of the form A:B; 0:40 are the first 40") from None
     if start < 0 or max(start, stop or 0) > _MOST_FRAMES:
         raise SlamError(f"frames {text!r}: numbers of frames go from 0 to {_MOST_FRAMES}")
     return start, stop
 
 
 def origin(options: RunOptions) -> dict[str, Any]:
-    """What ``config.json`` says besides names: the command, frames, settings, versions, and files by absolute path."""
-    run = {"command": options.command, "frames": [options.start, options.stop], "versions": versions()}
-    run["settings"] = options.config.to_json()
-    if not options.source:  # of a recording, or a sequence made in Python
-        return run
-    files = {"prior_map": options.prior_map, "calibration": options.calibration}
-    return {
-        **run,
-        "source": options.source if options.format in ("synthetic", "camera") else _place(options.source),
-        "source_format": options.format,
-        "kind": options.kind,
-        "mono": options.mono,
-        **{key: file and _place(str(file)) for key, file in files.items()},
-    }
+    """What ``config.json`` says besides names: the command and where it was typed, kind, frames, settings, versions."""
+    typed = {"command": options.command, "folder": str(Path.cwd())} if options.command else {}
+    what = {"kind": options.kind, "frames": [options.start, options.stop], "versions": versions()}
+    return typed | what | {"settings": options.config.to_json()}
 
 
 def versions() -> dict[str, str]:
@@ -100,18 +85,3 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[package] = "not installed"
     return found
-
-
-def changed_versions(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """What differs between two sets of versions, in words."""
-    return [f"{name} {old}, now {now.get(name)}" for name, old in then.items() if now.get(name) != old]
-
-
-def _place(text: str) -> str:
-    """A sequence or file by its absolute path, options behind it included; what is no file as it was given."""
-    if text.startswith(_NO_FILES):
-        return text
-    name, mark, query = text.rpartition("?")
-    if not mark or Path(text).expanduser().exists():
-        name, mark, query = text, "", ""
-    return f"{os.path.abspath(Path(name).expanduser())}{mark}{query}"  # noqa: PTH100 without following links

@@ -40,12 +40,14 @@ def outcome(
     doubt: str = "",
     driving: bool = False,
     backend: str = "",
+    recorded: bool = False,
 ) -> str:
     """What to say of a run in which many frames were not tracked, with the likely cause; empty for others.
 
     The first frame is not counted: there is no map yet, unless the run began `in_map`. The first of the `warnings` is
     taken for a cause; repeated images are counted instead. `dropped` frames of a live run came too late; `doubt`, of
     `motion_doubt`, is a cause where nothing else is one. `backend` names one of somebody's own, which may be the cause.
+    What was `recorded` has no images.
     """
     untracked = [row for row, status in enumerate(record.statuses) if row and status != _TRACKED]
     frames, missed = len(record.statuses) - 1, len(untracked)
@@ -54,7 +56,7 @@ def outcome(
     frozen = 2 * record.repeated > missed
     cause = next((line for line in warnings if REPEATED not in line), "")
     if not cause and not frozen:
-        cause = _starved(record, untracked, rig, in_map) or doubt
+        cause = _starved(record, untracked, rig, in_map, recorded) or doubt
         if not cause and dropped < frames:  # where most came, the gaps are hardly all of it
             cause = _unexplained(record, rig, driving)
             if backend:
@@ -75,13 +77,15 @@ def outcome(
     return f"{said}; likely cause: {'; and '.join(causes)}"
 
 
-def _starved(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: bool) -> str:
+def _starved(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: bool, recorded: bool) -> str:
     """The first step that gave frames that were not tracked too little, and what to look at; empty where none did."""
     features, stereo = np.median(np.array(record.features)[untracked], axis=0)
     without = set(record.without_right)
     for row in untracked:  # ascending: without a right image, or after such without a tracked one between
         without |= {row} if row - 1 in without else set()
     missing = len(without.intersection(untracked))
+    if features < ENOUGH_FEATURES and recorded:
+        return f"the run that was recorded was not tracked there: it has {features:.0f} measurements in their median"
     if features < ENOUGH_FEATURES:
         return f"the images show hardly anything to follow ({features:.0f} features in the median of these frames)"
     if 2 * record.hidden > len(untracked):
@@ -133,7 +137,8 @@ def scale_doubt(record: RunRecord, rig: StereoRig, driving: bool = False) -> str
     speeds, depth = _speeds(record), _depth(record)
     if len(speeds) < _LEAST_CHANGES or not np.isfinite(depth):
         return ""
-    asked = f"by the calibration the cameras are {rig.baseline:.3g} m apart; is that in metres? (unit=cm, unit=mm)"
+    apart = f"by the calibration the cameras are {rig.baseline:.3g} m apart"
+    asked = f"{apart}; is that in metres? (of a recording, unit=cm or unit=mm)"
     speed = float(np.median(speeds[:, 1]))
     if speed <= _FASTEST[driving] and depth >= _NEAREST[driving]:
         return asked if rig.baseline > _WIDEST[driving] else ""
@@ -205,5 +210,4 @@ def _depth(record: RunRecord) -> float:
 
 
 def _rounded(value: float) -> str:
-    """Two digits, without an exponent."""
     return f"{float(f'{value:.2g}'):g}"

@@ -7,7 +7,7 @@ import io
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +43,7 @@ class RunFiles(ExitStack):
     def __init__(self, folder: Path) -> None:
         super().__init__()
         self.folder = folder
-        self._made: list[Path] = []  # folders, the innermost first
         with ExitStack() as opened, naming_folder(folder):
-            self._made += [path for path in (folder, *folder.parents) if not path.exists()]
             folder.mkdir(parents=True, exist_ok=True)
             for name in set(NAMES).difference(_ROWS):
                 remove_file(folder / name)
@@ -56,16 +54,6 @@ class RunFiles(ExitStack):
             self._objects.write(csv_rows([OBJECT_COLUMNS]))
             self.enter_context(opened.pop_all())
 
-    def discard(self) -> None:
-        """Remove all files written, and the folders made for them where nothing else is in them."""
-        for rows in (self._trajectory, self._frames, self._objects):
-            rows.close()
-        with suppress(OSError):  # what cannot be removed stays
-            for name in NAMES:
-                remove_file(self.folder / name)
-            for made in self._made:
-                made.rmdir()
-
     def write_frame(self, number: int, result: FrameResult, loop: int | str = "", refused: int | str = "") -> None:
         """Append one frame, `number` in its sequence, to trajectory.txt, frames.csv and objects.csv.
 
@@ -73,17 +61,18 @@ class RunFiles(ExitStack):
         same of a place that it only seemed to show again.
         """
         e, r, features = result.estimate, result.report, result.features
-        sigmas = [float("nan")] * 4
+        sigmas, upper = [float("nan")] * 4, [""] * 21
         if result.located:
             R, P = e.T_world_left[:3, :3], e.covariance
             position = np.sqrt(np.maximum(np.diag(R @ P[3:, 3:] @ R.T), 0))
             sigmas = [*position, float(np.sqrt(max(np.trace(P[:3, :3]), 0.0)))]
+            upper = [f"{x:.9g}" for x in P[np.triu_indices(6)]]
         row = [
             number, f"{e.stamp:.9f}", result.status.value, result.reason,
             len(features), int(features.has_stereo.sum()), result.predicted,
             len(result.matched), len(r.used), len(r.rejected),
             len(result.added), len(result.erased), result.map_size, int(result.keyframe), loop, refused,
-            _number(features.threshold), _number(r.nis), r.dof, *map(_number, sigmas),
+            csv_number(features.threshold), csv_number(r.nis), r.dof, *map(csv_number, sigmas), *upper,
             *(f"{result.milliseconds.get(stage, 0.0):.3f}" for stage in STAGES),
         ]  # fmt: skip
         things = csv_rows(_object_row(number, thing) for thing in result.objects)
@@ -162,9 +151,9 @@ def _object_row(number: int, thing: MovingObject) -> list[Any]:
     return [number, f"{e.stamp:.9f}", thing.id, *flags, *(f"{x:.9g}" for x in numbers)]
 
 
-def _number(value: float) -> str:
+def csv_number(value: float) -> str:
     """A number for a CSV cell; empty where it is not finite."""
-    return f"{value:.6g}" if np.isfinite(value) else ""
+    return f"{value:.9g}" if np.isfinite(value) else ""
 
 
 def _finite(tree: Any) -> Any:

@@ -137,7 +137,8 @@ def drawn(runs: Sequence[RunData], kind: str) -> Figure:
         "time": ([["time"]], [2.6]),
     }
     rows, heights = layouts[kind]
-    lines = [_title(runs), *(f"{run.name}: {text}" for run in runs if (text := facts(run.summary)))]
+    brief = len(runs) > 1
+    lines = [_title(runs), *(f"{run.name}: {text}" for run in runs if (text := facts(run.summary, brief)))]
     head = "\n".join(textwrap.fill(line, int(_LETTERS * wide)) for line in lines) if kind == "summary" else ""
     with rc_context(_STYLE):
         figure = Figure(figsize=(wide, sum(heights) + (0.17 * head.count("\n") + 0.3 if head else 0.0)))
@@ -160,7 +161,7 @@ def drawn(runs: Sequence[RunData], kind: str) -> Figure:
 def _title(runs: Sequence[RunData]) -> str:
     """Sequence, frames, and how many of these were not tracked; the first one never is."""
     lost = {run.name: sum(status != "tracked" for status in run.status[1:]) for run in runs}
-    frames = ", ".join(dict.fromkeys(f"{len(run.status)} frames" for run in runs))
+    frames = f"{' and '.join(dict.fromkeys(str(len(run.status)) for run in runs))} frames"
     frames += "".join(f"; {name}: {count} not tracked" for name, count in lost.items() if count)
     return f"{runs[0].sequence}: {frames}"
 
@@ -186,20 +187,26 @@ def _coloured(runs: Sequence[RunData]) -> list[tuple[RunData, str, float]]:
 
 
 def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
-    """The paths from above, in the world of the first run that has a truth, and the true one."""
+    """The paths, in the world of the first run that has a truth, and the true one.
+
+    From above, or from the side where the camera moves most up and down.
+    """
     first = next((run for run in runs if run.truth is not None), None)
     paths: dict[str, list[Array]] = {}
     to_first = np.eye(4) if first is None else place_of_truth(first)
-    truth = None if first is None or first.truth is None else (to_first @ first.truth.poses)[:, [0, 2], 3]
+    truth = None if first is None or first.truth is None else (to_first @ first.truth.poses)[:, :3, 3]
     for run in runs:
         T = np.eye(4) if run.truth is None or run is first else to_first @ inverse(place_of_truth(run))
-        paths[run.name] = [(T @ path.poses)[:, [0, 2], 3] for path in (run.online, run.final)]
+        paths[run.name] = [(T @ path.poses)[:, :3, 3] for path in (run.online, run.final)]
     every = np.concatenate([*(online for online, _ in paths.values()), *([] if truth is None else [truth])])
-    factor, unit = _unit(float(np.ptp(every, axis=0).max()))
+    extent = np.ptp(every, axis=0)
+    factor, unit = _unit(float(extent.max()))
+    shown = [0, 2] if extent[1] < extent.max() else [0 if extent[0] > extent[2] else 2, 1]
+    signs = factor * np.array([1.0, 1.0 if shown[1] == 2 else -1.0])  # y points down
     if truth is not None:
-        axis.plot(*factor * truth.T, "--", color=_TRUTH, lw=1.0, label="true path", zorder=3)
+        axis.plot(*(signs * truth[:, shown]).T, "--", color=_TRUTH, lw=1.0, label="true path", zorder=3)
     for run, colour, width in _coloured(runs):
-        online, final = (factor * points for points in paths[run.name])
+        online, final = (signs * points[:, shown] for points in paths[run.name])
         axis.plot(*np.where(run.measured[:, None], online, np.nan).T, color=colour, lw=1.2 * width, alpha=0.75,
                   label=run.name)  # fmt: skip
         if not run.measured.all():
@@ -207,7 +214,9 @@ def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
         axis.plot(*online[:1].T, "o", color=colour, ms=4)
         if not (len(final) == len(online) and np.allclose(final, online, rtol=0, atol=1e-6 * factor)):
             axis.plot(*final.T, ":", color=colour, lw=1.5, label=f"{run.name}, final")
-    axis.set(title="Path from above, online (dot: start)", xlabel=f"right [{unit}]", ylabel=f"forward [{unit}]")
+    across, ahead = (f"{('right', 'up', 'forward')[k]} [{unit}]" for k in shown)
+    view = "above" if shown[1] == 2 else "the side"
+    axis.set(title=f"Path from {view}, online (dot: start)", xlabel=across, ylabel=ahead)
     axis.set_aspect("equal", adjustable="datalim")
     axis.legend(framealpha=0.8)
     axis.locator_params(axis="x", nbins=6)
@@ -292,14 +301,18 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
             if run.truth is not None:
                 axis.plot(time, times * error[:, k], color=colour, lw=0.7 * width)
             axis.plot(time, times * sigma[:, k], "--", color=colour, lw=0.7 * width)
-            for start in (run.online.stamps - run.online.stamps[:1])[~run.measured]:
+            every = run.online.stamps - run.online.stamps[:1]
+            for start in every[~run.measured]:
                 axis.axvspan(start, start, color=colour, alpha=0.2)
+            for start in every[~np.isin(every, time)]:
+                axis.axvspan(start, start + 1.1 * np.median(np.diff(every)), color="0.92", lw=0, zorder=0)
         values = np.concatenate([line.get_ydata() for line in axis.lines])
         values = values[values > 0]
         if len(values):
             axis.set_yscale("log")
             top = (2.0 if k or len(runs) == 1 else 6.0) * float(values.max())  # room for a legend
-            bottom = max(0.7 * float(values.min()), top * 10.0**-_DECADES)
+            middle = min(float(np.median(np.asarray(line.get_ydata()))) for line in axis.lines)  # of the lowest curve
+            bottom = max(0.7 * float(values.min()), min(top * 10.0**-_DECADES, 0.3 * middle))
             axis.set_ylim(bottom, top)
             for line in axis.lines:  # a curve ends at the axis
                 line.set_ydata(np.clip(line.get_ydata(), bottom, top))
@@ -311,7 +324,9 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
         end = max(float(np.ptp(run.online.stamps)) for run in runs)  # also where the truth begins later
         axis.set_xlim(-0.01 * end, 1.01 * end or 1.0)
     axes[0].tick_params(labelbottom=False)
+    noisy = any(run.truth is not None and not run.truth_is_exact for run in runs)
     title = "Online error since the start (solid), claimed σ (dashed)"
+    title += "\nσ with that of the truth; grey: the truth is doubtful" if noisy else ""
     axes[0].set_title(title if known else "Claimed σ of the online pose; no true path is known")
     axes[-1].set_xlabel("time [s]")
     if len(runs) > 1:

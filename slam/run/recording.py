@@ -114,7 +114,6 @@ def _recording(arrays: dict[str, np.ndarray]) -> Recording:
 
 
 def _frames(arrays: Mapping[str, np.ndarray], rig: StereoRig) -> tuple[RecordedFrame, ...]:
-    """What was given in each frame."""
     numbers, stamps, rows, pixels = (arrays[key] for key in ("numbers", "stamps", "rows", "pixels"))
     count = len(stamps)
     if len(numbers) != count:

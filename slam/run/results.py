@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.evaluation.consistency import EXACT
+from slam.evaluation.consistency import EXACT, PIXELS_ALONE
 from slam.evaluation.metrics import chi_square_band
 
 _SCALES = {"mm": 1e3, "%": 100.0}  # units in which people see metres and shares
@@ -27,7 +27,8 @@ class Metric:
     unit: str = ""  # in which people see it
     place: str = ""  # keys of a summary one below the other; "*": the mean over bodies in view; empty: computed
     better: str = ""  # "lower", "higher", "one" (1 is honest; both ways off is worse), or "" (neither)
-    shown: str = "compared"  # where: some of "compared", "main" (in a comparison's conclusions), "run", "picture"
+    #: Where: some of "compared", "main" (in a comparison's conclusions), "run", "picture", "brief" (in that of several)
+    shown: str = "compared"
 
     @property
     def main(self) -> bool:
@@ -83,17 +84,15 @@ METRICS = (
     Metric("loops_closed", "loops closed", "", "loops/closed", shown="compared run picture"),
     Metric("loops_refused", "loops refused", "", "loops/refused"),
     Metric("ate_online_m", "online path error (ATE, aligned)", "mm", "accuracy/online/ATE RMSE [m]", "lower",
-           "compared main run picture"),
+           "compared main run picture brief"),
     Metric("ate_final_m", "final path error (ATE, aligned)", "mm", "accuracy/final/ATE RMSE [m]", "lower",
-           "compared main run"),
-    Metric("ate_without_loops_m", "path error without loops (ATE, aligned)", "mm",
-           "accuracy/online without loops/ATE RMSE [m]", "lower"),
+           "compared main run brief"),
     Metric("rpe_1s_m", "drift in 1 s (RPE)", "mm", "accuracy/online/RPE RMSE over 1 s [m]", "lower", "compared run"),
     Metric("rpe_1s_deg", "drift in 1 s, rotation (RPE)", "deg", "accuracy/online/RPE rotation RMSE over 1 s [deg]",
            "lower"),
     Metric("segment_percent", "drift by distance (RPE)", "%", "accuracy/online/segment error [%]", "lower",
            "compared run"),
-    Metric("sigma_m", "claimed σ of the last position", "mm", "final_sigma_m", shown="run picture"),
+    Metric("sigma_m", "claimed σ of the last position", "mm", "final_sigma_m", shown="run picture brief"),
     Metric("ratio", "errors over claimed σ (1 is right)", shown="run"),
     Metric("nees_10m_per_dof", "NEES / 6 over 10 m (1 is right)", "", "consistency/NEES over 10 m", "one",
            "compared main"),
@@ -103,6 +102,7 @@ METRICS = (
     Metric("nees_100m_per_dof", "NEES / 6 over 100 m (1 is right)", "", "consistency/NEES over 100 m", "one"),
     Metric("exact_calibration", "cameras without errors, of which covariances count some", "",
            f"consistency/{EXACT}", shown=""),
+    Metric("pixels_alone", "covariances of pixel noise alone", "", f"consistency/{PIXELS_ALONE}", shown=""),
     Metric("nis_per_dof", "NIS / dof (up to 1 is right)", "", "consistency/NIS per degree of freedom"),
     Metric("map_size", "landmarks in the map, mean"),
     Metric("landmark_error_m", "median landmark error", "mm", "", "lower", "compared main"),
@@ -126,6 +126,7 @@ _NEES = {
     "nees_per_dof": "from the start",
     "nees_100m_per_dof": "over 100 m",
 }
+_KEYS = {over: key for key, over in _NEES.items()}
 _FEW = 0.5  # a NEES over less than this share of the stretches is no figure: they are hardly a fair choice
 
 
@@ -166,15 +167,19 @@ def rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, list[str
             yield metric.title, list(map(metric.show, values))
 
 
-def facts(summary: Mapping[str, Any]) -> str:
-    """What a run found, also where there is no truth, and whether its covariances hold, for the head of a picture."""
+def facts(summary: Mapping[str, Any], brief: bool = False) -> str:
+    """What a run found, also where there is no truth, and whether its covariances hold, for the head of a picture.
+
+    A `brief` one leaves out what runs of one sequence hardly differ in.
+    """
     if not summary:
         return ""
     found = figures(summary)
-    shown = [m for m in METRICS if "picture" in m.shown and found.get(m.key)]
+    shown = [m for m in METRICS if ("brief" if brief else "picture") in m.shown and found.get(m.key)]
     words = [f"{m.label} {m.show(found[m.key])} {m.unit}".rstrip() for m in shown]
     doubt = "do not trust this path, see the run's warnings" if summary.get("doubt") else ""
-    return "; ".join(filter(None, [doubt, *words, verdict_of_run(summary).partition(" (")[0]]))
+    covariances = verdict_of_run(summary).partition(":" if brief else " (")[0]
+    return "; ".join(filter(None, [doubt, *words, covariances]))
 
 
 def _measured(summary: Mapping[str, Any]) -> int:
@@ -183,7 +188,6 @@ def _measured(summary: Mapping[str, Any]) -> int:
 
 
 def _at(tree: Any, place: str, default: Any = None) -> Any:
-    """What is at a place of a summary."""
     for key in place.split("/"):
         tree = tree.get(key) if isinstance(tree, Mapping) else None
     return default if tree is None else tree
@@ -217,6 +221,8 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     band = f"({low:.2f} to {high:.2f} in 95 % of {of})"
     if exact:
         others.append("they count errors of the calibration, and this world's cameras have none")
+    if found.get("pixels_alone"):
+        others.append("they count pixel noise alone, and no errors of the calibration")
     return "; ".join([f"covariances {word}: {times} {band}", *others])
 
 
@@ -239,6 +245,10 @@ def verdict_of_run(summary: Mapping[str, Any]) -> str:
             "frame"
         )
         return f"covariances cannot be judged: {why}"
+    judged = next(iter(_ratios(figures(summary))))
+    exact = honest.get(f"{BY_KEY[_KEYS[judged]].place.partition('/')[2]}, truth exact")
+    if exact is not None and np.isfinite(exact):
+        text += f"; with a truth without errors of its own {number(float(np.sqrt(exact / 6)))} times"
     if doubtful:
         over, share = next(iter(doubtful.items()))
         text += f"; not judged: {100 * share:.0f} % of the stretches {over}, where the true path is doubtful"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from slam.errors import SlamError
+from slam.evaluation.consistency import by_mounting
 from slam.evaluation.metrics import align, associate
 from slam.evaluation.summary import rotation_errors
 from slam.evaluation.truth_error import interpolated, truth_covariances
@@ -48,7 +49,7 @@ class RunData:
     loops: np.ndarray  # rows of `final` whose places are the same (L, 2), the later one first
     refused: np.ndarray  # rows of `final` whose places only looked alike (L, 2), the later one first
     old: Array  # landmarks that had left the map before the end (M, 3) [m]
-    objects: Sequence[tuple[float, str, Array]]  # stamp [s], id and position (3,) [m] of each body in each frame
+    bodies: Mapping[str, Array]  # where each moving body was measured (B, 3) [m], by id
     summary: Mapping[str, Any]  # of the run; empty where there is none
 
     @classmethod
@@ -67,6 +68,7 @@ class RunData:
     def _read(cls, folder: Path, name: str) -> RunData:
         landmarks, frames = _rows(folder / "landmarks.csv"), _rows(folder / "frames.csv")
         old = _rows(folder / OLD_LANDMARKS) if (folder / OLD_LANDMARKS).exists() else []
+        objects = _rows(folder / "objects.csv")
         upper = _numbers(landmarks, "cxx", "cxy", "cxz", "cyy", "cyz", "czz")
         located = [row for row in frames if row["sd_x"]]
         sd = _numbers(located, "sd_x", "sd_y", "sd_z", "sd_rotation")
@@ -101,18 +103,12 @@ class RunData:
             loops=pairs("loop"),
             refused=pairs("refused"),
             old=_numbers(old, *"xyz"),
-            objects=[
-                (float(row["stamp"]), row["id"], np.array([float(row[axis]) for axis in "xyz"]))
-                for row in _rows(folder / "objects.csv")
-            ],
+            bodies={
+                body: _numbers([row for row in objects if row["id"] == body], *"xyz")
+                for body in dict.fromkeys(row["id"] for row in objects)
+            },
             summary=summary,
         )
-
-    @property
-    def bodies(self) -> dict[str, Array]:
-        """Where moving bodies were measured (B, 3) [m], by id."""
-        ids = dict.fromkeys(body for _, body, _ in self.objects)
-        return {body: np.array([place for _, own, place in self.objects if own == body]) for body in ids}
 
     @property
     def centre(self) -> Array:
@@ -178,7 +174,8 @@ def pose_errors(run: RunData) -> tuple[Array, Array, Array]:
     turned = np.linalg.norm(rotation_errors(own, true, 0.0 if run.truth_is_exact else _TURNED), axis=1)
     first, last = np.zeros(len(own), np.intp), np.arange(len(own))
     A = adjoint(inverse(inverse(own.poses[first]) @ own.poses))
-    P = truth_covariances(true, run.truth_noise, first, last, A)
+    P, J = truth_covariances(true, run.truth_noise, first, last, A), by_mounting(true, run.truth_noise, first, last, A)
+    P[:, 3:, 3:] += J[:, 3:] @ np.swapaxes(J[:, 3:], 1, 2)  # a constant turn is taken from the rotation's error instead
     of_truth = np.column_stack([np.trace(P[:, i : i + 3, i : i + 3], axis1=1, axis2=2) for i in (3, 0)])
     claimed = run.deviations[np.searchsorted(run.online.stamps, own.stamps)]
     sigma = np.sqrt(claimed**2 + np.maximum(of_truth, 0.0) * [1, np.degrees(1) ** 2])

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -161,17 +162,20 @@ class _Run:
         """Write what each frame gives, and in the end the rest, however it ends; returns the summary.
 
         Raises:
-            SlamError: a file cannot be written; all others are.
+            SlamError: a file cannot be written; all others are. What stopped the run goes on instead, after warnings.
+            Exception: a defect of the program, as it is.
         """
         record, options, score = self.record, self.options, score_for(self.sequence)
         names = {"sequence": self.sequence.name, "format": self.sequence.format}
         names |= {"frontend": options.frontend, "backend": options.backend}
         ended, stopped_by = "completed", None
+        every = iter(results)
+        first = list(islice(every, 1))  # an error before it is done leaves no file
         with RunFiles(options.out) as files:
             write_json(options.out / "config.json", origin(options) | names)
             self._attempt(write_json, options.out / "schema.json", schema())
             try:
-                for number, result in results:
+                for number, result in chain(first, every):
                     record.add(number, result)
                     files.write_frame(number, result, self._place(result.loop), self._place(result.refused_loop))
                     if score is not None:
@@ -187,11 +191,14 @@ class _Run:
                 if self.live is not None and self.live.ended_early and stopped_by is None:
                     ended = "ended by the user"
                 summary = names | {"ended": ended} | self._tracking()
-                if stopped_by is None or record.numbers:
-                    self._write_last(files, summary, score)
-                else:
-                    files.discard()
-                self._raise_failures(stopped_by)
+                self._write_last(files, summary, score)
+                lines = list(dict.fromkeys(map(_said, self.failures)))
+                if stopped_by is not None:  # it goes on
+                    for line in lines:
+                        logger.warning("%s", line)
+                elif lines:
+                    defects = (error for error in self.failures if not isinstance(error, SlamError))
+                    raise next(defects, SlamError("; ".join(lines)))
         return summary
 
     def _place(self, step: int | None) -> int | str:
@@ -202,25 +209,8 @@ class _Run:
         """What a function gives; where it fails the other files are written all the same."""
         try:
             return write(*given)
-        except Exception as error:  # noqa: BLE001 `_raise_failures` raises it
+        except Exception as error:  # noqa: BLE001 `drive` raises it
             self.failures.append(error)
-
-    def _raise_failures(self, stopped_by: BaseException | None) -> None:
-        """Raise what failed, in one line with the error that stopped the run; a signal goes on, after warnings.
-
-        Raises:
-            SlamError: a file could not be written.
-            Exception: a defect of the program, as it is.
-        """
-        lines = list(dict.fromkeys(map(_said, self.failures)))
-        if isinstance(stopped_by, SlamError) and lines:
-            raise type(stopped_by)("; ".join(dict.fromkeys([str(stopped_by), *lines]))) from stopped_by
-        if stopped_by is not None:
-            for line in lines:
-                logger.warning("%s", line)
-        elif lines:
-            defects = (error for error in self.failures if not isinstance(error, SlamError))
-            raise next(defects, SlamError("; ".join(lines)))
 
     def _write_last(self, files: RunFiles, summary: dict[str, Any], score: Any) -> None:
         """Write the files that are made at the end; the summary says how good the run was."""
@@ -266,7 +256,8 @@ class _Run:
         doubt = no_path or motion_doubt(record, options.config.models.motion, driving)
         in_map, dropped = options.prior_map is not None, self.live.dropped if self.live else 0
         own = options.backend if ":" in options.backend else ""
-        tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving, own)
+        recorded = isinstance(self.sequence, Recording)
+        tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving, own, recorded)
         if doubt and not tracking:
             logger.warning("%s", doubt)
         return {
@@ -280,5 +271,4 @@ class _Run:
 
 
 def _said(error: BaseException) -> str:
-    """An error in one line."""
     return one_line(text_of(error)) or type(error).__name__

@@ -59,6 +59,11 @@ _POSE = _table(
     "qx qy qz qw | | unit quaternion that turns camera coordinates to world coordinates",
 )
 
+_POSE_COVARIANCE = (
+    f"{_upper('c', '012345')} | rad², rad·m, m² | covariance of the pose, upper triangle row by row: 0 to 2 rotation "
+    "about x, y, z, 3 to 5 translation along x, y, z, both"
+)
+
 FRAME_TABLE = _table(
     "frame | | number of the frame in the sequence",
     "stamp | s | time of the frame",
@@ -73,6 +78,7 @@ FRAME_TABLE = _table(
     "nis nis_dof | | normalised innovation squared of the measurements used, and its degrees of freedom",
     "sd_x sd_y sd_z | m | standard deviations of the position, along the axes of the world",
     "sd_rotation | rad | standard deviation of the orientation, all three axes together",
+    f"{_POSE_COVARIANCE} in the camera's axes, perturbing the pose on the right",
     *(f"ms_{stage} | ms | wall time of a stage: {text}" for stage, text in STAGE_NAMES.items()),
 )
 
@@ -97,8 +103,7 @@ OBJECT_TABLE = _table(
     "motion_x motion_y motion_z | m | motion since the frame before: a point of the body went from p to R p + t in "
     "the world; this is t",
     "motion_roll motion_pitch motion_yaw | rad | R of that motion",
-    f"{_upper('c', '012345')} | rad², rad·m, m² | covariance of the pose, upper triangle row by row: 0 to 2 rotation "
-    "about x, y, z, 3 to 5 translation along x, y, z, both in body axes, perturbing the pose on the right",
+    f"{_POSE_COVARIANCE} in body axes, perturbing the pose on the right",
 )
 
 #: Landmarks that had left the map before the end.

@@ -20,7 +20,6 @@ from slam.naming import unknown
 from slam.settings import can_be_set, leaves
 
 _ENTRY = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)
-_UNIT = re.compile(r"\[((?:px|m|rad|s|degrees|grey levels)(?:[²³]|/s²?|/√s)*(?: / √s)?)\]")
 _RIG = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
 _FIRST = next(iter(KINDS))
 _PARTS = ("frontend", "backend")  # sections whose settings are those of a class chosen by name
@@ -33,8 +32,7 @@ class Setting:
     key: str  # as ``--set`` takes it, such as ``"map.max_landmarks"``
     owner: str  # the front end or back end that has it; empty for settings that all runs have
     defaults: dict[str, Any]  # by kind of motion
-    unit: str  # empty for words, counts and ratios
-    text: str  # what it means
+    text: str  # what it means, with its unit
 
 
 def settings() -> Iterator[Setting]:
@@ -45,7 +43,7 @@ def settings() -> Iterator[Setting]:
         if path[0] not in _PARTS and can_be_set(key):
             parts = {kind: reduce(getattr, path, config) for kind, config in configs.items()}
             defaults = {kind: getattr(part, name) for kind, part in parts.items()}
-            yield Setting(key, "", defaults, *documented(type(parts[_FIRST])).get(name, ("", "")))
+            yield Setting(key, "", defaults, documented(type(parts[_FIRST])).get(name, ""))
     for section in _PARTS:
         for name in registry.names(f"{section}s"):
             yield from _options_of(section, name)
@@ -59,7 +57,7 @@ def _options_of(section: str, name: str) -> Iterator[Setting]:
         if can_be_set(key, name):
             configs = {kind: SystemConfig.for_kind(kind, name if section == "frontend" else None) for kind in KINDS}
             defaults = {kind: getattr(config, section).get(option, default) for kind, config in configs.items()}
-            yield Setting(key, name, defaults, *documented(described).get(option, ("", "")))
+            yield Setting(key, name, defaults, documented(described).get(option, ""))
 
 
 def listing(wanted: str | None, width: int) -> Iterator[str]:
@@ -87,35 +85,30 @@ def listing(wanted: str | None, width: int) -> Iterator[str]:
     before = ""
     for setting in chosen:
         section = setting.key.partition(".")[0]
-        what = f"options of {setting.owner}" if setting.owner else documented(SystemConfig)[section][1]
+        what = f"options of {setting.owner}" if setting.owner else documented(SystemConfig)[section]
         if (title := f"{section}: {what}") != before:
             yield from ([""] if before else [])
             yield from wrap(title, width)
             before = title
-        (_, first), *others = setting.defaults.items()
-        line = f"  {setting.key} = {_typed(first)}{setting.unit and f' {setting.unit}'}"
-        yield line + "".join(f"; {kind}: {_typed(value)}" for kind, value in others if value != first)
+        (_, first), *rest = setting.defaults.items()
+        others = (f"; {kind}: {_typed(value)}" for kind, value in rest if value != first)
+        yield f"  {setting.key} = {_typed(first)}{''.join(others)}"
         yield from wrap(setting.text, width, initial_indent="      ", subsequent_indent="      ")
     yield from ("", "Change one with --set KEY=VALUE.")
 
 
 def _typed(value: Any) -> str:
-    """A value as it can be typed."""
     return (value or '""') if isinstance(value, str) else json.dumps(value)
 
 
-def documented(kind: Any) -> dict[str, tuple[str, str]]:
-    """Unit and meaning of each field of a class, from the ``Attributes:`` of its docstring and of its bases'.
+def documented(kind: Any) -> dict[str, str]:
+    """Meaning of each field of a class, from the ``Attributes:`` of its docstring and of its bases'.
 
     Of arguments of a constructor or function, from ``Args:``.
     """
-    found: dict[str, tuple[str, str]] = {}
+    found: dict[str, str] = {}
     for base in reversed(getattr(kind, "__mro__", (kind,))):
         section = re.search(r"^(?:Attributes|Args):\n((?: {4}.*\n?|\n)*)", cleandoc(base.__doc__ or ""), re.M)
         for names, text in _ENTRY.findall(section[1] if section else ""):
-            plain = " ".join(text.split())
-            units, each = _UNIT.findall(plain), names.split(", ")
-            for i, name in enumerate(each):
-                unit = units[i] if len(units) == len(each) else units[0] if units else ""
-                found[name] = unit, plain.replace("``", "").rstrip(".")
+            found |= dict.fromkeys(names.split(", "), " ".join(text.split()).replace("``", "").rstrip("."))
     return found

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 
 from slam.data import CommonError, Estimate, FrameResult
-from slam.evaluation.consistency import EXACT
+from slam.evaluation.consistency import EXACT, PIXELS_ALONE
 from slam.evaluation.objects import ObjectScore
 from slam.evaluation.summary import consistency, evaluate
-from slam.geometry.se3 import Array, inverse
+from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.input.features import Rectification
 from slam.input.warnings import REPEATED
-from slam.interfaces import Backend
+from slam.interfaces import Backend, ConsideringBackend
 from slam.run.recording import Recording
 from slam.run.schema import STAGES
-from slam.runtime.compilation import compile_clock, working_time
+from slam.runtime.compilation import compile_clock
 from slam.sequences import Sequence
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
@@ -40,10 +40,8 @@ class RunRecord:
     statuses: list[str] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
     common: list[CommonError] = field(default_factory=list)
-    T_map_odom: list[Array] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
     milliseconds: list[dict[str, float]] = field(default_factory=list)
-    times: list[float] = field(default_factory=list)  # at the end of each frame, compiling left out [s]
     compiled_before: float = field(default_factory=compile_clock.seconds)  # [s]
     ages: list[float] = field(default_factory=list)  # of frames of a live run when they are done [s]
     features: list[tuple[int, int]] = field(default_factory=list)  # number of them, and of those with a right pixel
@@ -65,7 +63,6 @@ class RunRecord:
         self.numbers.append(number)
         self.statuses.append(result.status.value)
         self.milliseconds.append(dict(result.milliseconds))
-        self.times.append(working_time())
         self.repeated += result.reason == REPEATED
         self.hidden += result.reason == HIDDEN
         self.features.append((len(result.features), int(result.features.has_stereo.sum())))
@@ -80,7 +77,6 @@ class RunRecord:
         self.poses.append(result.estimate.T_world_left)
         self.covariances.append(result.estimate.covariance)
         self.common.append(result.common)
-        self.T_map_odom.append(result.T_map_odom)
         self.measured.append(result.status.measured)
         self.rejected += len(result.report.rejected)
         self.used += len(result.report.used)
@@ -152,29 +148,23 @@ def results_of(
         values = getattr(sequence, "values", None)  # of a world: with recordings nobody knows
         if "mean NEES" in found["consistency"] and system.config.self_calibration.enabled and values is not None:
             found["consistency"][EXACT] = not (values["focal_error"] or values["turn_error"])
+        if found["consistency"].get("dof") and system.config.self_calibration.enabled:
+            found["consistency"][PIXELS_ALONE] = not isinstance(system.backend, ConsideringBackend)
         found["self_calibration"] = system.calibration.summary()
         found["loops"] = system.atlas.summary()
         found["bodies"] = len(record.bodies)
-        if system.atlas.loops or system.atlas.refused:
-            odometry = Trajectory(path.stamps, inverse(np.array(record.T_map_odom)) @ path.poses)
-            found["accuracy"]["online without loops"] = evaluate(odometry.select(measured), sequence)
     if score is not None:
         found["objects"] = score.summary()
     return found | _times(record)
 
 
 def _times(record: RunRecord) -> dict[str, Any]:
-    """Medians per stage, and the rate, over all frames but the first, which may wait for compilers."""
+    """Medians per stage over all frames but the first, which may wait for compilers."""
     totals = [sum(each.values()) for each in record.milliseconds]
     later = record.milliseconds[1:] or record.milliseconds
     median = {stage: float(np.median([each.get(stage, 0.0) for each in later])) for stage in STAGES}
-    seconds = record.times[-1] - record.times[0]
     times = {"median": median, "median_total": float(np.median(totals[1:] or totals)), "first_frame": totals[0]}
-    return {
-        "milliseconds": times,
-        "frames_per_second": (len(record.times) - 1) / seconds if seconds > 0 else None,
-        "compile_seconds": compile_clock.seconds() - record.compiled_before,
-    }
+    return {"milliseconds": times, "compile_seconds": compile_clock.seconds() - record.compiled_before}
 
 
 def live_frames(live: LiveFrames, record: RunRecord) -> dict[str, Any]:
@@ -183,5 +173,4 @@ def live_frames(live: LiveFrames, record: RunRecord) -> dict[str, Any]:
     return {
         "frames dropped": live.dropped,
         "milliseconds behind": {"median": float(np.median(later)), "max": float(later.max())},
-        "clock waited [s]": live.clock_waited,
     }

@@ -16,12 +16,11 @@ import numpy as np
 
 from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError, one_line, text_of
-from slam.files import noting_inputs, require_utf8
+from slam.files import require_utf8
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, quaternion
 from slam.geometry.trajectory import Trajectory
-from slam.outputs import Output, require_outputs
-from slam.run.run_data import RunData
+from slam.outputs import Output
 from slam.run.schema import body_colour
 from slam.system import StereoSlam
 
@@ -45,7 +44,7 @@ class Viewer:
         try:
             self.rr = import_module("rerun")
         except ImportError as error:
-            raise SlamError("the viewer needs Rerun: pip install rerun-sdk") from error
+            raise SlamError("the viewer needs Rerun: pip install '.[viewer]' in the checkout, or rerun-sdk") from error
         self._target, self._rig, self._truth = target, rig, truth
         self._recording = _open(self.rr, target)
         self._stamps: list[float] = []
@@ -125,24 +124,6 @@ class Viewer:
 def outputs(target: str | None, option: str) -> list[Output]:
     """The file that a `Viewer` writes; none where it opens a window, or there is none."""
     return [] if target in (None, LIVE) else [Output(Path(target), option, makes_folder=True)]
-
-
-def view_run(folder: Path, target: str, overwrite: bool = False) -> None:
-    """Show a finished run from its files: path, objects, and the map at its end; images are not among them.
-
-    Raises SlamError where the folder does not hold a finished run, and as `Viewer` does.
-    """
-    with noting_inputs() as inputs:
-        run = RunData.read(folder, folder.name)
-    require_outputs(outputs(target, "--to"), inputs, overwrite)
-    with Viewer(target) as viewer:
-        for number, (stamp, pose) in enumerate(zip(run.online.stamps, run.online.poses)):
-            viewer.show_pose(number, float(stamp), pose)
-            for seen, name, position in run.objects:
-                if abs(seen - stamp) < 1e-6:
-                    mark = viewer.rr.Points3D([position], colors=body_colour(int(name)), radii=0.03)
-                    viewer.log(f"/objects/{name}", mark)
-        viewer.show_map(run.positions, run.covariances, run.seen_last)
 
 
 def _open(rr: Any, target: str) -> Any:

@@ -21,7 +21,8 @@ from slam.sequences import euroc, folders, kitti, ros
 from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, logger, read_masks, turned
 from slam.sequences.folders import VIDEO_SUFFIXES
 from slam.sequences.images import IMAGE_SUFFIXES
-from slam.sequences.options import RECORDED, Options, read_options
+from slam.sequences.options import RECORDED, Options
+from slam.settings import read_query
 
 __all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
 
@@ -31,8 +32,6 @@ _LISTED = 6  # sequences below a folder
 
 
 class _Format(NamedTuple):
-    """A format on disk."""
-
     matches: Callable[[Path], bool]  # whether a folder or file looks like it
     open: Callable[[Path, Options, FaultLog], RecordedSequence]
     description: str
@@ -61,7 +60,7 @@ def formats() -> dict[str, str]:
     return {name: known.description for name, known in _FORMATS.items()} | {"camera": camera, "synthetic": worlds}
 
 
-def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
+def open_sequence(path: str | Path, format: str | None = None, quiet: bool = False) -> Sequence:
     """Open a stereo sequence; nothing but the first pair of images is decoded yet.
 
     Args:
@@ -69,6 +68,7 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
             ``synthetic:NAME?key=value``; or ``camera:0?calibration=FILE``, see `slam.sequences.camera`.
             ``kind=driving`` or ``kind=handheld`` goes with all of them but the synthetic worlds.
         format: one of `formats`; found out from the folder where it is None.
+        quiet: what is wrong with its files is kept in its `warnings` alone, and not logged.
 
     Raises:
         SequenceError: the folder is missing, empty or of no known format, or the sequence cannot be read.
@@ -89,12 +89,12 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
 
         return open_camera(text.removeprefix("camera:"))
     try:
-        return _open_folder(text, format)
+        return _open_folder(text, format, quiet)
     except OSError as error:  # no permission, too long a name, a folder that is not what it seems (/proc)
         raise SequenceError(f"{error.filename or text}: {reason(error)}") from error
 
 
-def _open_folder(text: str, format: str | None) -> RecordedSequence:
+def _open_folder(text: str, format: str | None, quiet: bool) -> RecordedSequence:
     """A sequence on disk; what is wrong with its options is said before what is wrong with its files."""
     name, mark, query = text.rpartition("?")
     if not mark or _exists(text):
@@ -114,14 +114,13 @@ def _open_folder(text: str, format: str | None) -> RecordedSequence:
         masks = read_masks(options.get("mask"), folder if folder.is_dir() else folder.parent, found.rig)
         swap = options.get("swap", False)
         options.require_read(f"{folder} is read as {name}")
-    for line in lines:
+    for line in () if quiet else lines:
         logger.warning("%s", line)
     truth = turned(found.ground_truth, found.rig)
     return replace(found, ground_truth=truth, masks=masks, swap=swap, warnings=lines)
 
 
 def _open_world(text: str) -> Sequence:
-    """A synthetic world by its text, ``synthetic:`` left out."""
     from slam.worlds import open_world
 
     name, mark, query = text.partition("?")
@@ -129,7 +128,7 @@ def _open_world(text: str) -> Sequence:
     masks = [part for part in parts if part.startswith("mask=")]
     opened = open_world(name + mark + "&".join(part for part in parts if part not in masks))
     if masks:
-        opened.masks = read_masks(read_options(masks[-1])["mask"], Path.cwd(), opened.rig)
+        opened.masks = read_masks(read_query(masks[-1])["mask"], Path.cwd(), opened.rig)
         opened.name = text
     return opened
 
@@ -152,13 +151,12 @@ def _exists(text: str) -> bool:
 
 
 def _format_of(folder: Path) -> str | None:
-    """The first format that a folder or file looks like; None for no sequence."""
     return next((name for name, known in _FORMATS.items() if known.matches(folder)), None)
 
 
 def _format_asked(folder: Path, query: str, text: str) -> str | None:
     """The first format that a folder looks like; what is neither a recording nor a folder of something is refused."""
-    named = read_options(query).keys()
+    named = read_query(query).keys()
     if ros.matches_folder(folder):
         return "ros"
     if not folder.exists():
@@ -201,4 +199,6 @@ def _hint_near(folder: Path) -> str:
             return f"; it is a part of one: give {parent} (format {name})"
     if images:
         return f"; where each image holds both cameras: '{folder.name}?layout=sbs'; else name both: ?left=…&right=…"
-    return f"; where two cameras are in it by other names: '{folder.name}?left=…&right=…'"
+    names = sorted(path.name for path in islice(folder.iterdir(), _LOOKED_AT) if path.is_dir())
+    left, right = names if len(names) == 2 else ("…", "…")
+    return f"; where two cameras are in it by other names: '{folder.name}?left={left}&right={right}'"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -77,16 +77,6 @@ def is_live(frames: object) -> bool:
 
 #: So many faults of one kind are reported one by one; the others are counted.
 _LINES_PER_KIND = 5
-
-
-@contextmanager
-def said_before() -> Iterator[None]:
-    """For opening a sequence once more: what its files lack was logged the first time, and is only kept."""
-    before, logger.disabled = logger.disabled, True
-    try:
-        yield
-    finally:
-        logger.disabled = before
 
 
 class FaultLog:

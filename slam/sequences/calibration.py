@@ -247,7 +247,6 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
 
 
 def _read_xml(text: str) -> dict[str, Any]:
-    """The entries of a storage in XML: texts, and the parts of matrices."""
     if "<!" in text.replace("<!--", ""):  # OpenCV writes no entities, which may stand for gigabytes
         raise CalibrationError("a calibration has no document type and no entities")
     try:

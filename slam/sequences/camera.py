@@ -17,8 +17,9 @@ from slam.files import expanded
 from slam.geometry.trajectory import Trajectory
 from slam.sequences.base import FaultLog, as_used, read_masks
 from slam.sequences.images import both, grabbed_image, quiet_libraries, recorded_size, require_same_size, size_text
-from slam.sequences.options import CALIBRATION, Options, read_options
+from slam.sequences.options import CALIBRATION, Options
 from slam.sequences.rigs import calibration_files, read_rig
+from slam.settings import read_query
 
 OPTIONS = CALIBRATION | {"width", "height", "fps", "wait"}
 
@@ -34,7 +35,7 @@ Pair = tuple[float, np.ndarray, np.ndarray]  # stamp [s], left and right image
 def open_camera(text: str) -> CameraSequence:
     """A camera by its text, ``camera:`` left out; a question mark may be part of an address in a network."""
     name, mark, query = text.rpartition("?")
-    if not mark or ("://" in name and not set(read_options(query)) <= OPTIONS):
+    if not mark or ("://" in name and not set(read_query(query)) <= OPTIONS):
         name, query = text, ""
     return CameraSequence(name, Options(query, "camera", OPTIONS))
 
@@ -197,7 +198,6 @@ def without_password(address: str) -> str:
 
 
 def _hint(address: str) -> str:
-    """What may be the reason."""
     import cv2
 
     if address.isdecimal():

@@ -49,7 +49,6 @@ def _root(folder: Path) -> Path:
 
 
 def _listings(root: Path, faults: FaultLog) -> list[Listing]:
-    """The images of both cameras that exist, by ``data.csv`` or, where there is none, by their names."""
     cameras = [root / cam for cam in _CAMERAS]
     for camera in cameras:
         if not camera.is_dir():

@@ -69,7 +69,6 @@ def decode_image(data: bytes, what: str, size: Size | None = None) -> np.ndarray
 
 
 def _grey(image: Any, what: str) -> np.ndarray:
-    """The pixels (H, W) of a loaded image."""
     import cv2
 
     if image.mode == "L":

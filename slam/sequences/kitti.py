@@ -217,7 +217,6 @@ def imu_poses(records: Array) -> Array:
 
 
 def _record(text: str) -> list[float]:
-    """The first six numbers of an OXTS record."""
     row = numbers(text, 6, _OXTS)
     if abs(row[0]) >= 90 or max(map(abs, (row[1], *row[3:]))) > 360:
         raise ValueError(f"{text!r:.40} is not {_OXTS}")

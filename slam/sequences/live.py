@@ -29,7 +29,6 @@ class LiveFrames:
 
     Attributes:
         dropped: number of frames that were replaced by a newer one before they were taken.
-        clock_waited: how long the clock has waited for reading, in total [s].
         ended_early: whether it was ended by `until` before the last frame.
 
     Examples:
@@ -48,7 +47,6 @@ class LiveFrames:
         self, frames: Sequence | Iterable[StereoFrame], paced: bool | None = None, until: threading.Event | None = None
     ) -> None:
         self.dropped = 0
-        self.clock_waited = 0.0
         self.ended_early = False
         self._frames = frames
         self._paced = not is_live(frames) if paced is None else paced
@@ -104,8 +102,7 @@ class LiveFrames:
                 if self._paced:
                     now = time.monotonic()
                     origin = now - frame.stamp if origin is None else origin
-                    late = max(0.0, now - (origin + frame.stamp))
-                    origin, self.clock_waited = origin + late, self.clock_waited + late
+                    origin = max(origin, now - frame.stamp)  # the clock waits for reading
                     while (rest := origin + frame.stamp - time.monotonic()) > 0 and not self._ending():
                         time.sleep(min(rest, _LOOK))
                 if self._ending():
@@ -124,5 +121,4 @@ class LiveFrames:
                 self._changed.notify_all()
 
     def _ending(self) -> bool:
-        """Whether nobody takes frames any more."""
         return self._closed or self._until.is_set()

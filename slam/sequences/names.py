@@ -63,7 +63,6 @@ def natural(name: str) -> list[tuple[str, int]]:
 
 
 def _skeleton(name: str) -> str:
-    """A name's text around its numbers."""
     return re.sub(r"-?\d+([.,]\d+)?", "0", stem(name))
 
 
@@ -159,7 +158,6 @@ def _nanoseconds(part: tuple[str, ...], width: int) -> int:
 
 
 def _numbers(sides: Sequence[Sequence[str]]) -> Keys | None:
-    """Numbers of frames in the names, see `keys_of`."""
     tables = [_columns(names) for names in sides]
     if not all(tables):
         return None

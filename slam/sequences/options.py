@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from typing import Any
-from urllib.parse import parse_qsl
 
 from slam.errors import ConfigurationError
 from slam.naming import suggestion
+from slam.settings import read_query
 
 #: Options of every format whose calibration is in a file that can be named.
 CALIBRATION = frozenset({"calibration", "unit", "rectified", "fisheye", "kind", "mask", "swap"})
@@ -62,13 +62,11 @@ class Options(dict[str, Any]):
 
     def __init__(self, query: str, format: str, known: frozenset[str]) -> None:
         self._read = {"kind"}
-        texts = read_options(query)
+        texts = read_query(query)
         strange = sorted(set(texts) - known)
         if strange:
             hint = f"{suggestion(strange[0], known)}; known: {', '.join(sorted(known))}"
             raise ConfigurationError(f"unknown option {strange[0]!r} of format {format}{hint}")
-        if len(parse_qsl(query, keep_blank_values=True)) > len(texts):
-            raise ConfigurationError(f"an option is given twice: {query}")
         super().__init__({name: value_of(name, text) for name, text in texts.items()})
 
     def __getitem__(self, name: str) -> Any:
@@ -84,15 +82,3 @@ class Options(dict[str, Any]):
         """Raise ConfigurationError where an option was not read by anything."""
         for name in sorted(set(self) - self._read):
             raise ConfigurationError(f"option {name!r} does nothing here: {what}")
-
-
-def read_options(query: str) -> dict[str, str]:
-    """The options ``key=value&key=value`` as texts."""
-    try:
-        texts = dict(parse_qsl(query, keep_blank_values=True, max_num_fields=100))
-    except ValueError:
-        raise ConfigurationError("more than 100 options") from None
-    for name, text in texts.items():
-        if "\0" in text:
-            raise ConfigurationError(f"option {name!r} holds a NUL")
-    return texts

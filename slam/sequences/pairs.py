@@ -13,7 +13,7 @@ import numpy as np
 from slam.errors import SequenceError
 from slam.files import expanded, note_input, reason
 from slam.geometry.se3 import Array
-from slam.geometry.stamps import IntArray, increasing, pair, trim
+from slam.geometry.stamps import IntArray, increasing, pair
 from slam.naming import count
 from slam.sequences.base import Decoder, FaultLog, Images, attempt
 from slam.sequences.images import IMAGE_SUFFIXES, Size, both, read_image, require_same_size
@@ -82,7 +82,6 @@ def open_images(
 
 
 def _decoded(frames: list[list[Path | None]], size: Size, start: int, stop: int, faults: FaultLog) -> Images:
-    """The images of the files of each frame, all of one size."""
     for paths in frames[start:stop]:
         yield tuple(None if path is None else attempt(read_image, path, size) for path in paths)
 
@@ -199,15 +198,15 @@ def _partners(left: Listing, right: Listing, options: Options, told: bool, fault
         default = 0.98 * half if told and len(left) > 1 else min(_TOLERANCE, half)
         tolerance = round(1e9 * options.get("tolerance", 1e-9 * default))
     partner = pair(left.keys, right.keys, tolerance)
-    kept = np.arange(len(left))[trim(partner)]
-    if not len(kept):
+    paired = np.flatnonzero(partner >= 0)
+    if not len(paired):
         gap = int(np.abs(right.keys[pair(left.keys, right.keys, np.inf)] - left.keys).min())
         apart = f"{gap} frames apart"
         if left.stamped:
             hint = "see tolerance=… [s]" if gap <= WIDEST_TOLERANCE * 1e9 else "the clocks of the cameras differ"
             apart = f"{1e-6 * gap:.6g} ms apart, {1e-6 * tolerance:.6g} ms are allowed; {hint}"
         raise SequenceError(f"no image of {left.folder} has a partner in {right.folder}: the nearest two are {apart}")
-    swap = options.get("swap", False)
+    kept, swap = np.arange(paired[0], paired[-1] + 1), options.get("swap", False)
     alone = kept[partner[kept] < 0]
     first = f" (first: {left.names[alone[0]]})" if len(alone) else ""
     for side, other, number, where, then in (

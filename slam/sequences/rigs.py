@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
-from slam.files import expanded, write_text
+from slam.files import expanded
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, pose, so3_exp
+from slam.geometry.se3 import Array, inverse, is_rotation, pose, so3_exp
 from slam.sequences.calibration import Entries, array, naming, plain_name, read_entries
 from slam.sequences.images import Size, recorded_size, size_text
 from slam.sequences.options import value_of
@@ -169,6 +169,9 @@ def _rig(entries: Entries, images: Size | None, unit: float, rectified: bool, fi
     if missing or T_right_left is None:
         raise entries.incomplete(missing)
     left, right = (_camera(entries, side, sizes[side] or size, fisheye) for side in (0, 1))
+    for side, other in enumerate((right, left)):
+        if other.has_distortion and not any(entries.find(role, side) for role in ("D", *_COEFFICIENTS)):
+            raise entries.incomplete([f"D{side + 1}"])
     R, t = T_right_left[:3, :3], T_right_left[:3, 3]
     b = R.T @ t  # h_right = R (h_left + b), paper A, Eq. 6
     if entries.form and b[0] > np.abs(b).max() / 2:
@@ -204,9 +207,8 @@ def projection_offset(P: Array) -> Array:
 
 def rigid(T: Array, name: str) -> Array:
     """The rigid motion (4, 4); CalibrationError where its rotation is none."""
-    R = T[:3, :3]
-    if np.abs(R).max() > 1.01 or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-        raise CalibrationError(f"{name} is not a rigid motion: its rotation is {R.tolist()}")
+    if not is_rotation(T[:3, :3], 1e-3):
+        raise CalibrationError(f"{name} is not a rigid motion: its rotation is {T[:3, :3].tolist()}")
     return T
 
 
@@ -319,21 +321,3 @@ def _size(entries: Entries, side: int) -> Size | None:
         if both is not None:
             return int(both[0]), int(both[1])
     return None
-
-
-def write_opencv(path: Path, rig: StereoRig) -> None:
-    """Write a rig, as recorded, with the entries of ``cv2.stereoCalibrate`` [m]; SlamError where that fails."""
-    import cv2
-
-    left, right, R, b = rig.as_recorded
-    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
-    storage.write("image_width", left.width)
-    storage.write("image_height", left.height)
-    if rig.left.model == "equidistant":
-        storage.write("distortion_model", "equidistant")
-    for number, camera in enumerate((left, right), 1):
-        storage.write(f"K{number}", camera.K)
-        storage.write(f"D{number}", np.array([camera.distortion or (0.0,) * 4]))
-    storage.write("R", R)
-    storage.write("T", (R @ b).reshape(3, 1))
-    write_text(path, storage.releaseAndGetString())

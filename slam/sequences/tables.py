@@ -13,7 +13,7 @@ import numpy as np
 from slam.checks import SINCE_1970, UNITS
 from slam.errors import SequenceError, TrajectoryError
 from slam.files import read_text
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, is_rotation
 from slam.geometry.trajectory import Trajectory
 from slam.sequences.base import FaultLog
 
@@ -25,7 +25,7 @@ MOST_NANOSECONDS = 2**63 - 1
 #: Largest coordinate of a true path [m]: the Earth's circumference.
 LARGEST = 4.1e7
 
-_ROTATION = 1e-2  # largest error of an element of RᵀR: files have six digits and more
+_ROTATION = 1e-2  # largest error of an element of RRᵀ: files have six digits and more
 _MOST_SECONDS = 1e11  # of a time, either side of zero: in nanoseconds it would not fit into 64 bits long before
 _SLOWEST, _USUAL = 10.0, 0.05  # [s] between frames: at most, else they are in another unit; by which it is found
 _HEADING = re.compile(r"\D*(time|stamp|\bt\b|\bsec|\b[num]s\b)\D*", re.IGNORECASE)  # a first row that names the columns
@@ -120,9 +120,7 @@ def require_truth(path: Trajectory, source: Path) -> Trajectory:
     """The true path of a file; TrajectoryError where a rotation or position is impossible, or all positions zero."""
     if not len(path):
         raise TrajectoryError(f"{source}: no pose is left")
-    R = path.poses[:, :3, :3]
-    R = np.where((np.abs(R).max(axis=(1, 2)) > 1 + _ROTATION)[:, None, None], 0.0, R)
-    improper = (np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) > _ROTATION) | (np.linalg.det(R) < 0)
+    improper = ~is_rotation(path.poses[:, :3, :3], _ROTATION)
     beyond = np.abs(path.positions).max(axis=1) > LARGEST
     for wrong, what in ((beyond, "position of pose {} is beyond the Earth"), (improper, "rotation of pose {} is none")):
         if wrong.any():

@@ -72,7 +72,8 @@ def _is_in_order(report: UpdateReport, seen: Observations) -> None:
     require(used > 0.8 * (used + rejected), f"{rejected} of {used + rejected} good observations were rejected")
     own = not np.isin(report.used, report.rejected).any() and np.isin(report.used, seen.ids).all()
     require(own, "a landmark is both used and rejected, or was not observed")
-    require(2 * used <= dof <= 4 * used, f"{dof} degrees of freedom of {used} landmarks: 2 to 4 each are expected")
+    counts = f"the report's dof is {dof} for {used} landmarks used: it counts 2 to 4 measured pixels of each"
+    require(2 * used <= dof <= 4 * used, counts)
     require(report.nis >= 0, f"NIS is {report.nis:.3g}: it must be a number of at least 0")
 
 

@@ -300,7 +300,6 @@ def queries_are_pure(factory: Factory) -> None:
 
 
 def _ask(backend: Backend) -> None:
-    """Every question, twice."""
     for _ in range(2):
         backend.estimate(landmarks=False)
         backend.positions(backend.estimate().ids)

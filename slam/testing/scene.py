@@ -31,13 +31,12 @@ NONE = np.zeros(0, np.int64)
 class Scene:
     """A camera that flies slowly through points, with noisy observations of all of them that are in view."""
 
-    rig: StereoRig
     poses: Array
     points: Array
     frames: tuple[Observations, ...]
 
 
-def make_scene(count: int = 15, rig: StereoRig = RIG) -> Scene:
+def make_scene(count: int = 15) -> Scene:
     """A scene of 60 points, with so many frames."""
     rng = np.random.default_rng(5)
     points = rng.uniform((-4, -3, 4), (4, 3, 12), (60, 3))
@@ -45,8 +44,8 @@ def make_scene(count: int = 15, rig: StereoRig = RIG) -> Scene:
     poses = [np.eye(4)]
     for _ in range(count - 1):
         poses.append(poses[-1] @ step)
-    frames = tuple(observe(rig, T, points, rng) for T in poses)
-    return Scene(rig, np.array(poses), points, frames)
+    frames = tuple(observe(RIG, T, points, rng) for T in poses)
+    return Scene(np.array(poses), points, frames)
 
 
 def observe(rig: StereoRig, T: Array, points: Array, rng: np.random.Generator) -> Observations:
@@ -96,7 +95,7 @@ class Run:
 
 def tracked(factory: Factory, scene: Scene, models: EstimatorModels = MODELS) -> tuple[Run, list[UpdateReport]]:
     """A back end after all frames of a scene, and its reports."""
-    run = Run(factory, scene.rig, models)
+    run = Run(factory, models=models)
     return run, [run.step(k, seen)[1] for k, seen in enumerate(scene.frames)]
 
 
@@ -156,7 +155,6 @@ def require_equal(one: Any, other: Any, what: str) -> None:
 
 
 def _few(values: Array) -> str:
-    """The first few of the values."""
     return ", ".join(f"{value:.6g}" for value in values.ravel()[:3]) + (", …" if values.size > 3 else "")
 
 

@@ -16,6 +16,7 @@ _ASSOCIATION = {  # least and largest values
 _MAP = {
     "target_in_view": (3, 10**6), "max_depth_error": (LEAST, 1.0), "erase_share": _SHARE, "erase_missed": _COUNT,
     "lost_after": _COUNT, "restart_after": _COUNT, "descriptor_update": _SHARE,
+    "grid": (1, 1000),
 }  # fmt: skip
 
 

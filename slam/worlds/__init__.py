@@ -72,7 +72,6 @@ def describe(name: str) -> str:
 
 
 def _scene(name: str) -> Scene:
-    """A built-in world."""
     if name not in SCENES:
         raise UnknownNameError(unknown("world", name, tuple(SCENES)))
     return SCENES[name]
@@ -95,6 +94,5 @@ def describe_common() -> str:
 
 
 def _line(o: Option) -> str:
-    """An option in a line."""
     default = o.default if o.default != "" else "none"
     return f"  {o.name}={default}  {o.text} ({o.range})"

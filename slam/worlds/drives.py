@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from slam.errors import SequenceError, TrajectoryError
 from slam.files import expanded, read_text
-from slam.geometry.se3 import Array, pose
+from slam.geometry.se3 import Array, is_rotation, pose
 from slam.geometry.trajectory import Trajectory
 from slam.worlds.paths import camera_poses, sway
 
@@ -42,8 +42,7 @@ def read_path(text: str) -> Trajectory:
         raise SequenceError(str(error)) from error
     path = Trajectory(path.stamps / _FILE_RATE if of_kitti else path.stamps - path.stamps[0], path.poses)
     R, steps = path.poses[:, :3, :3], np.diff(path.positions, axis=0)
-    wrong = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)) > 1e-3
-    wrong |= np.linalg.det(R) < 0
+    wrong = ~is_rotation(R, 1e-3)
     if wrong.any():
         raise SequenceError(f"{file}: the pose of row {int(np.argmax(wrong))} has no rotation")
     down = R[:, :, 1].mean(axis=0)

@@ -91,7 +91,6 @@ def _write_images(sequence: WorldSequence, root: Path, frames: range, progress: 
 
 
 def _camera_text(camera: PinholeCamera, T_body_camera: Array, rate: float) -> str:
-    """A camera as EuRoC's ``sensor.yaml`` has it."""
     import yaml
 
     node = {

@@ -68,7 +68,6 @@ def _pace(x: Array) -> Array:
 
 
 def _aisle_walls(layout: int) -> list[Rectangle]:
-    """Shelves on both sides, floor, ceiling, end walls and a stretch of bare wall."""
     length, depth, behind = END_X - START_X, SHELF_Y - OTHER_Y, SHELF_Y + 0.2
     above, back = CEILING - HEIGHT, OTHER_Y - 0.2
 
@@ -147,7 +146,6 @@ def _orbit(t: Array, stamps: Array, layout: int) -> Array:
 
 
 def _desk_room(layout: int) -> list[Rectangle]:
-    """Desk, wall with pinned papers, and the things on the desk."""
     board = Material(1.1, 0.75, "board", layout, 160, (0.01, 0.05))
     top = Material(1.5, 0.75, "wood", layout, 60, (0.006, 0.02))
     out = [

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 
 from slam.data import BoolArray
 from slam.errors import ConfigurationError
 from slam.naming import suggestion
+from slam.settings import read_query
 
 
 @dataclass(frozen=True)
@@ -110,15 +110,12 @@ def parse_query(world: str, query: str, table: Mapping[str, Option]) -> dict[str
     Raises:
         ConfigurationError: a key is unknown or stands twice, or a value has a wrong type or lies outside its range.
     """
-    given: dict[str, Any] = {}
-    for part in filter(None, query.split("&")):
-        key, text = (unquote(word) for word in part.partition("=")[::2])
+    given: dict[str, Any] = read_query(query)
+    for key, text in given.items():
         if key not in table:
             known = f"{suggestion(key, table)}; known: {', '.join(sorted(table))}"
             raise ConfigurationError(f"world {world!r} has no option {key!r}{known}")
         try:
-            if key in given:
-                raise ConfigurationError(f"option {key!r} is given twice")
             given[key] = table[key].parse(text)
         except ConfigurationError as error:
             raise ConfigurationError(f"world {world!r}: {error}") from None

@@ -37,7 +37,6 @@ def paint(texture: Texture, density: float) -> np.ndarray:
 
 
 def _paint_material(piece: Material | Signs, density: float) -> np.ndarray:
-    """A piece of a material, or a board of signs."""
     recipe = RECIPES[piece.material]
     rng = np.random.default_rng([piece.seed, 63])
     density *= recipe.detail
@@ -57,7 +56,6 @@ def _frame(page: Page, edge: float, colour: Colour) -> None:
 
 
 def _cover(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """The cover or the spine of a book."""
     colour = rng.uniform(30, 190, 3)
     page = Page(tinted(1 + 0.04 * rng.standard_normal(size, np.float32), colour), rng)
     ink = (230.0, 235.0, 240.0) if colour.mean() < 120 else _DARK
@@ -72,7 +70,6 @@ def _cover(size: Size, rng: Rng, density: float) -> np.ndarray:
 
 
 def _poster(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A poster: heading, shapes, print."""
     ground = rng.uniform(120, 240, 3)
     page = Page(mottled(size, rng, density, ground, (0.02, 0.1, 3)), rng)
     page.title(7, page.part(0.08, 0.04, 0.84, 0.14), _DARK)
@@ -89,7 +86,6 @@ def _poster(size: Size, rng: Rng, density: float) -> np.ndarray:
 
 
 def _ceiling(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """Ceiling panels with lamps."""
     page = Page(mottled(size, rng, density, (205.0, 210.0, 212.0), (0.01, 0.05, 3)), rng)
     step, joint = 0.6 * density, 0.012 * density
     for x in np.arange(0, page.width, step):
@@ -102,7 +98,6 @@ def _ceiling(size: Size, rng: Rng, density: float) -> np.ndarray:
 
 
 def _carton(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A side of a carton: brown board, tape, print and a label."""
     ribs = grain(size, rng, (2.0, 0.2 * density))
     page = Page(tinted(1 + 0.03 * ribs + 0.04 * clouds(size, rng, 0.1 * density), (105.0, 150.0, 185.0)), rng)
     page.bar(page.part(0, 0.44, 1, 0.12), (130.0, 175.0, 205.0))
@@ -125,7 +120,6 @@ _PAINTS = ((40, 40, 150), (130, 80, 40), (60, 60, 60), (185, 190, 195), (215, 22
 
 
 def _paint_facade(house: Facade, density: float) -> np.ndarray:
-    """The picture of a house front, BGR uint8, `density` texels per metre."""
     rng = np.random.default_rng([house.seed, 64])
     size = round(house.height * density), round(house.width * density)
     colour = _WALLS[int(rng.integers(len(_WALLS)))]
@@ -153,7 +147,6 @@ def _paint_facade(house: Facade, density: float) -> np.ndarray:
 
 
 def _bricks(page: Page) -> None:
-    """Courses of bricks."""
     course, length = 0.09 * page.density, 0.26 * page.density
     for row, y in enumerate(np.arange(0, page.height, course)):
         for x in np.arange(-length / 2 * (row % 2), page.width, length):
@@ -163,7 +156,6 @@ def _bricks(page: Page) -> None:
 
 
 def _window(page: Page, box: Box) -> None:
-    """A window with its frame, panes, sill, and sometimes shutters or a curtain."""
     rng, (left, top, w, h), frame = page.rng, box, 0.07 * page.density
     page.bar((left - frame, top - frame, w + 2 * frame, h + 2 * frame), (225.0, 230.0, 232.0))
     glass = rng.uniform(35, 90)
@@ -180,7 +172,6 @@ def _window(page: Page, box: Box) -> None:
 
 
 def _asphalt(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """Asphalt."""
     light = 1 + 0.05 * clouds(size, rng, 2.0 * density, 4) + 0.06 * clouds(size, rng, 2.0, 1)
     return tinted(light, (88.0, 86.0, 85.0))
 

@@ -118,7 +118,6 @@ class _Block(NamedTuple):
 
 
 def _blocks(placed: Placed, i: int, labels: np.ndarray) -> list[_Block]:
-    """The blocks of a rectangle."""
     (top, bottom), (left, right) = placed.rows[i].tolist(), placed.columns[i].tolist()
     if left >= right:
         return []

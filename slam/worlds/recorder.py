@@ -37,7 +37,6 @@ class Recorder:
         return StereoFrame(index, stamp, left, right)
 
     def _shoot(self, frame: int, lens: Lens, T_left_camera: Array, stream: int) -> np.ndarray:
-        """One camera's image."""
         bodies, T_world_camera = self._world.T_world_body(frame), self._world.T_world_left[frame] @ T_left_camera
         sky = _SKY if self._values["colour"] else (round(float(np.mean(_SKY))),)
         image = lens.expose(draw(self._world.drawn[1], self._ripmap, bodies, T_world_camera, lens.view, sky))
@@ -46,7 +45,6 @@ class Recorder:
 
     @cached_property
     def _lenses(self) -> tuple[Lens, Lens]:
-        """Left and right camera."""
         return Lens.of(self._world.rig.left, _SUPERSAMPLE), Lens.of(self._world.rig.right, _SUPERSAMPLE)
 
     def _ripmap(self, rectangle: int) -> Ripmap:

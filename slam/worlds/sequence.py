@@ -119,7 +119,6 @@ class WorldSequence:
 
     @cached_property
     def _looks(self) -> Appearance:
-        """Descriptors of the landmarks."""
         return appearance(self.world, self.values)
 
     @cached_property

@@ -146,7 +146,6 @@ class Streets:
         yield from (run for run in np.split(rows, np.flatnonzero(apart) + 1) if len(run) > 1)
 
     def _fronts(self, run: IdArray, side: int) -> Iterator[Rectangle]:
-        """The house fronts of one run, a house each."""
         way = self._road.way[run]
         edge = self._road.xy[run] + side * ASIDE * self._road.left[run]
         for a, b, part in self._pieces(way[0], way[-1], side):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import sys
 from dataclasses import replace
+from inspect import getattr_static
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +80,7 @@ def test_a_guarded_back_end_keeps_count_of_its_additional_methods_and_gives_noth
         backend.add(replace(seen, ids=np.array([4])))
     assert pickle.loads(pickle.dumps(backend)).estimate().ids.tolist() == [3, 4]
     small = load_script("docs/examples/small_filter.py").SmallFilter(RIG)
+    assert getattr_static(backend, "recent", None) is not None  # as Python 3.12 looks for a protocol's methods
     assert isinstance(backend, MapBackend) and not isinstance(small, MapBackend | RestingBackend | RevisingBackend)
 
 

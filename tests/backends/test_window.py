@@ -158,6 +158,24 @@ def test_a_revision_that_takes_a_depth_away_leaves_a_path():
     assert len(backend.trajectory()) == 2
 
 
+@pytest.mark.parametrize("name", ["smoother", "window"])
+def test_a_revision_moves_the_past_and_not_the_newest_pose(name):
+    """With disparities 3 % larger the path so far is 3 % shorter; the next pose is where it would have been."""
+    last, data = 11, scene(path(12, 0.1, np.array([0.0, 0.0, 0.8]), np.array([0.0, 0.03, 0.0])), points=200)
+    mended, as_it_was = (backends.create(name, RIG, models=EstimatorModels(MotionModel(0.5, 0.5))) for _ in range(2))
+    known: list[set[int]] = [set(), set()]
+    for k, (stamp, _, seen) in enumerate(data):
+        right = seen.uv_right + np.outer(0.03 * (seen.uv_left - seen.uv_right)[:, 0], [1.0, 0.0])
+        wrong = Observations(seen.ids, seen.uv_left, right)
+        if k == last:
+            mended.revise(lambda z: z - np.outer(0.03 / 0.97 * (z[:, 0] - z[:, 2]), [0.0, 0.0, 1.0]))
+        for backend, ids, given in zip((mended, as_it_was), known, (seen if k == last else wrong, wrong)):
+            step(backend, stamp, given, ids)
+    ours, theirs = (backend.trajectory().positions for backend in (mended, as_it_was))
+    assert np.linalg.norm(ours[-1] - theirs[-1]) < 4e-3
+    assert np.linalg.norm(ours[0] - theirs[0]) > 0.02
+
+
 def test_a_landmark_known_in_the_world_is_as_uncertain_as_the_pose():
     pose = np.eye(4)
     pose[:3, :3] = se3.so3_exp(np.array([0.0, np.pi / 2, 0.0]))

@@ -32,7 +32,6 @@ class Changed(EkfBackend):
 
 
 ANSWERS = [
-    ("predict", lambda p: None, "predict: must be of type Prediction"),
     ("predict", lambda p: replace(p, T_world_left=np.full((4, 4), np.nan)), "predict: T_world_left is not finite"),
     (
         "predict",
@@ -40,24 +39,18 @@ ANSWERS = [
         "predict: .* no rotation and translation",
     ),
     ("predict", lambda p: replace(p, covariance=np.eye(3)), "predict: covariance must be an array"),
-    ("predict", lambda p: replace(p, uv_left=p.uv_left[None]), "predict: uv_left"),
     ("update", lambda r: None, "update: must be of type UpdateReport"),
-    ("update", lambda r: replace(r, nis="1"), "update: nis must be of type Real"),
     ("update", lambda r: replace(r, used=r.used.astype(float)), "update: used must be an array"),
-    ("estimate", lambda e: replace(e, stamp=None), "estimate: stamp must be of type Real"),
     ("estimate", lambda e: replace(e, stamp=np.nan), "estimate: stamp must be within"),
-    ("estimate", lambda e: replace(e, positions=None), "estimate: positions must be an array"),
-    ("estimate", lambda e: replace(e, covariance=np.full((6, 6), np.inf)), "estimate: covariance is not finite"),
     ("estimate", lambda e: replace(e, covariance=-np.eye(6)), "estimate: covariance has a negative variance"),
     ("positions", lambda x: x[:-1] if len(x) else None, "positions:? must be (of type|an) (ndarray|array)"),
-    ("positions", lambda x: x * np.nan, "positions is not finite"),
 ]
 
 
 @pytest.mark.parametrize("method,change,words", ANSWERS)
 def test_a_back_end_of_nonsense_is_named(method, change, words):
     system = StereoSlam(RIG, "surf", Changed(method, change))
-    with pytest.raises(SlamError, match=f"Changed.{words}"):
+    with pytest.raises(SlamError, match=f"^frame [01]: Changed.{words}"):
         for stamp in (0.0, 0.1):  # positions are asked for once there are landmarks
             system.process(LEFT, RIGHT, stamp)
 
@@ -85,10 +78,7 @@ def aligning(**answers) -> StereoSlam:
 
 
 WRONG = [
-    ("patches", lambda p: None, "patches: must be of type Patches"),
-    ("patches", lambda p: replace(p, images=p.images[:1]), "patches: images must be|patches: centres"),
     ("patches", lambda p: Patches(p.images, p.centres[:, :1], p.size), "patches: centres"),
-    ("align", lambda f: None, "align: must be of type tuple"),
     ("align", lambda f: (f[0][:-1], f[1]), "align: must give left and right"),
 ]
 
@@ -137,6 +127,15 @@ def test_a_failing_back_end_is_named_and_the_cause_is_kept(method, error):
     with pytest.raises(PartError, match=rf"^frame 0: Failing.fails failed: {type(error).__name__}") as raised:
         system.process(LEFT, RIGHT, 0.0)
     assert raised.value.__cause__ is error
+
+
+def test_the_line_named_is_of_the_back_end_and_not_of_the_library_that_it_calls():
+    class Singular(EkfBackend):
+        def predict(self, stamp):
+            return np.linalg.inv(np.zeros((2, 2)))
+
+    with pytest.raises(PartError, match=r"LinAlgError: Singular matrix \(test_answers\.py, line \d+\)"):
+        StereoSlam(RIG, "surf", Singular(RIG, models=EstimatorModels())).process(LEFT, RIGHT, 0.0)
 
 
 def test_a_front_end_that_stops_does_not_end_the_frames():

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from experiments.simulated_recording import true_recording
-from slam.atlas.map_io import SavedMap
-from slam.errors import SequenceError, SlamError
+from slam.errors import SequenceError
 from slam.run.recording import load_recording, save_recording
 from slam.sequences import open_sequence
-from slam.system import StereoSlam
 
 
 def packed(members, method=zipfile.ZIP_DEFLATED):
@@ -63,23 +61,3 @@ def test_encrypted_odd_and_many_members(tmp_path, members):
     refused(tmp_path, data[: at + 8] + b"\x01" + data[at + 9 :], "encrypted")
     refused(tmp_path, packed(members, zipfile.ZIP_LZMA), "packed in a way")
     refused(tmp_path, packed({f"{k}": b"" for k in range(200)}), "200 members")
-
-
-def test_a_recording_of_many_stamps_is_checked_quickly(tmp_path, members):
-    n = 100_000
-    data = changed(members, stamps=np.arange(n, dtype=float), numbers=np.arange(n))
-    (tmp_path / "a.npz").write_bytes(data)
-    started = time.process_time()
-    assert len(load_recording(tmp_path / "a.npz")) == n
-    assert time.process_time() - started < 10.0  # on a slow machine; what looks at all pairs takes minutes
-
-
-def test_a_map_that_the_filter_cannot_hold_is_refused_in_a_line():
-    n = 100_000
-    known = SavedMap(
-        np.arange(n), np.ones((n, 3)), np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 4), np.float32),
-        np.ones(n, np.int8), np.ones(n, np.int64), np.ones(n, np.int64),
-    )  # fmt: skip
-    rig = open_sequence("synthetic:desk?frames=1").rig
-    with pytest.raises(SlamError, match="100000 landmarks, but EkfBackend takes a map of at most 2000"):
-        StereoSlam(rig, None, "ekf", prior_map=known)

@@ -15,7 +15,7 @@ from frontends.surf.config import SurfConfig
 from slam.bodies.config import ObjectsConfig
 from slam.calibration.config import SelfCalibrationConfig
 from slam.config import SystemConfig
-from slam.errors import ConfigurationError, SlamError, one_line
+from slam.errors import ConfigurationError
 from slam.models import EstimatorModels, MotionModel, ObjectModels
 from slam.tracks.config import AssociationConfig, MapConfig
 
@@ -42,21 +42,14 @@ def test_settings_reach_their_place():
         ("maps.max_landmarks=3", "unknown section 'maps' (did you mean 'map.max_landmarks'?); known: models"),
         ("map.max_landmarks", "not of the form"),
         ("models.pixel_sigma=abc", "models.pixel_sigma must be a number, got 'abc'"),
-        ("map.max_landmarks=many", "map.max_landmarks must be a whole number, got 'many'"),
         ("association.align=often", "association.align must be true or false, got 'often'"),
-        ("map.grid=3", "map.grid must be a list"),
         ("models.T_world_left=[1]", "models.T_world_left must be a (4, 4) pose"),
         ("models.pixel_sigma=-1", "pixel_sigma must be positive"),
         ("backend.rig=3", "backend.rig: the system gives this"),
         ("map=3", "is a section"),
         ("association.d_match=[NaN, 0.2]", "d_match must be finite"),
-        ("association.consistency_sigmas=-3", "consistency_sigmas must be finite and not negative"),
         ("association.window_sigmas=[5.0, 2.5]", "must be ascending, one for each value of d_match"),
-        ("association.window_max=2", "window_min must not lie above window_max"),
-        ("association.ratio=1.5", "ratio must be finite and not negative, from"),
         ("map.max_landmarks=3", "target_in_view must not lie above max_landmarks"),
-        ("map.lost_after=0", "lost_after must be finite and not negative, from 1"),
-        ("map.max_landmark=3", "did you mean 'max_landmarks'?"),
         ("map.max_speed=3", "did you mean 'objects.max_speed'?"),  # not that of the models, which cannot be set
     ],
 )
@@ -74,9 +67,7 @@ def test_unknown_kind_and_unknown_key_in_a_file():
         SystemConfig.from_json(tree)
 
 
-@pytest.mark.parametrize(
-    ("section", "value"), [("models", []), ("models.motion", None), ("map", "x"), ("objects", 3), ("atlas", True)]
-)
+@pytest.mark.parametrize(("section", "value"), [("models.motion", None), ("map", "x")])
 def test_a_section_that_is_none_is_named(section, value):
     tree = SystemConfig().to_json()
     *path, name = section.split(".")
@@ -113,9 +104,3 @@ def test_every_field_of_every_class_refuses_what_it_cannot_be(kind):
                 refused += 1
                 assert "\n" not in str(error) and len(str(error)) < 700 and f.name in str(error)
         assert refused >= 8, f"{kind.__name__}.{f.name} takes nearly anything"
-
-
-def test_one_line():
-    assert one_line("a\nb\x1b[1mc\0") == r"a b\x1b[1mc\x00"
-    assert len(one_line("x" * 10_000)) < 700 and "…" in one_line("x" * 10_000)
-    assert str(SlamError("a\r\nb")) == r"a\r b"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from slam.errors import SlamError
@@ -75,33 +76,20 @@ def test_two_outputs_are_not_the_same(tmp_path):
 @pytest.mark.parametrize(
     ("path", "words"),
     [
-        ("loop", "symbolic links"), ("folder", "not a regular file"), ("pipe", "not a regular file"),
-        ("text/a", "ot a directory|not a folder"), ("missing/a", "no folder"), ("x" * 300, "too long"),
-        ("a\0b", "no possible"), ("nothing", "no such file"),
+        ("loop", "symbolic links"), ("folder", "not a regular file"), ("text/a", "ot a directory|not a folder"),
+        ("missing/a", "no folder"), ("x" * 300, "too long"), ("a\0b", "no possible"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_written_is_said(tmp_path, path, words):
     (tmp_path / "loop").symlink_to("loop")
-    (tmp_path / "nothing").symlink_to("nowhere")
     (tmp_path / "folder").mkdir()
     (tmp_path / "text").write_text("x")
-    os.mkfifo(tmp_path / "pipe")
     refused([file(tmp_path / path)], words, overwrite=True)
     if path not in ("folder", "missing/a"):
         refused([folder(tmp_path / path)], "cannot be written|no possible", overwrite=True)
 
 
-def test_something_else_in_place_of_a_file_of_a_folder(tmp_path):
-    (tmp_path / "a.txt").mkdir()
-    refused([folder(tmp_path)], "not a regular file", overwrite=True)
-    (tmp_path / "a.txt").rmdir()
-    (tmp_path / "runs").write_text("x")
-    refused([folder(tmp_path)], "not a folder", overwrite=True)
-
-
 def test_what_a_link_points_to_is_left_alone(tmp_path):
-    import numpy as np
-
     (tmp_path / "real").write_text("mine")
     for name in ("rows", "picture.png"):
         (tmp_path / name).symlink_to("real")

@@ -61,19 +61,6 @@ def test_a_camera_that_stands_still_is_tracked_by_its_noise():
     assert {r.status for r in results[1:]} == {FrameStatus.TRACKED} and s.warnings == []
 
 
-@pytest.mark.slow
-def test_what_another_thread_has_read_ahead_is_not_taken_for_the_frame_before():
-    frames = shown([0, 1, 2])
-    s = system()
-    for _ in s.run(iter(frames)):  # the frames after the first are extracted, but no step is made of them
-        break
-    assert repeats([s.process(frames[1]), s.process(frames[2])]) == []
-    s, t = system(), system()
-    overlapping = [result for _, result in s.run(shown(FROZEN), overlap=True)]
-    assert repeats(overlapping) == repeats(result for _, result in t.run(shown(FROZEN), overlap=False))
-    assert s.trajectory().poses.tobytes() == t.trajectory().poses.tobytes()
-
-
 def test_the_camera_is_looked_for_in_a_map_as_long_as_it_is_not_found():
     first = system()
     for frame in shown(list(range(8))):

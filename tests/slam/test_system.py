@@ -70,16 +70,6 @@ def test_a_new_map_forgets_what_the_rig_s_error_does_to_the_landmarks_of_the_old
     assert len(system.restarted) >= 2
 
 
-def test_time_must_increase():
-    cloud = Cloud()
-    system = StereoSlam(RIG, None, "ekf", config=CONFIG)
-    system.process_features(cloud.features(np.eye(4), 1.0)[0])
-    with pytest.raises(MeasurementError, match="1"):
-        system.process_features(cloud.features(np.eye(4), 1.0)[0])
-    with pytest.raises(MeasurementError):
-        system.process_features(cloud.features(np.eye(4), float("nan"))[0])
-
-
 def test_landmarks_held_in_suspicion_stay_and_are_not_counted():
     cloud = Cloud(150)
     system = StereoSlam(RIG, None, "ekf", config=CONFIG.with_settings(["objects.mode=off"]))

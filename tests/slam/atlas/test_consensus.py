@@ -118,6 +118,30 @@ def test_true_loops_take_the_place_of_a_false_one_before_them():
     assert atlas.partners(true[-1].second)[0] is not None
 
 
+def test_a_loop_that_contradicts_another_is_closed_where_all_that_was_seen_agrees():
+    """The first glance of a place is off by what is rare; a second, which waits, lies between it and the truth."""
+
+    def glance(second: int, off: float) -> Loop:
+        wrong = loop(second, exp(np.array([0.0, 0.0, 0.0, off, 0.0, 0.0])))
+        return replace(wrong, covariance=100 * wrong.covariance)
+
+    def between(off: float) -> float:
+        chain = Chain(ODOM[:65], CHAIN.steps[:65])
+        graph = PoseGraph.solved(chain, [glance(62, off)], ODOM[:65], (4, 64))
+        return disagreement(graph, glance(64, 0.0)) - 26.0
+
+    off = brentq(between, 0.3, 5.0)
+    whole, path = atlas_of(65), Trajectory(0.1 * np.arange(65), ODOM[:65])
+    first = replace(whole, loops=(glance(62, off),))
+    alone = close(first, glance(64, 0.0), CommonError(), lambda: path, False)
+    assert alone.refused == ((4, 64),)
+    together = close(
+        first.with_inactive_loop(glance(63, 0.6 * off)), glance(64, 0.0), CommonError(), lambda: path, False
+    )
+    assert together.refused == ()
+    assert {(2, 62), (4, 64)} <= {x.pair for x in together.loops}
+
+
 @pytest.mark.parametrize("number", [2, 4])
 def test_false_loops_of_one_place_do_not_outvote_true_ones(number):
     true, false = [loop(62), loop(70)], [loop(k, FALSE) for k in range(75, 75 + number)]

@@ -8,9 +8,7 @@ import pytest
 
 import slam
 from slam.calibration import RigModel, RigPosterior
-from slam.calibration.corrected import corrected_rig
 from slam.errors import SlamError
-from slam.run import calibrating
 from slam.run.calibrating import _judged
 from tests.scripts import command
 
@@ -22,9 +20,7 @@ QUIET = ("-q", "--no-picture")
 def made(tmp_path_factory):
     """What two recordings of one rig leave, and what is printed."""
     folder = tmp_path_factory.mktemp("made")
-    files = {"--out": "rig.json", "--opencv": "rig.yaml"}
-    words = [str(word) for option, name in files.items() for word in (option, folder / name)]
-    return folder, command("calibrate", WORLD, f"{WORLD}&seed=1", *words)
+    return folder, command("calibrate", WORLD, f"{WORLD}&seed=1", "--out", folder / "rig.json")
 
 
 def test_two_recordings_of_one_rig(made):
@@ -35,19 +31,15 @@ def test_two_recordings_of_one_rig(made):
     assert all(abs(row["mean"] + 1e-3) < 3 * row["sigma"] for row in turn)
     assert any(abs(row["mean"]) > 1e-4 for row in turn)
     assert tree["agreement"].startswith("The recordings agree")
-    assert all(word in printed for word in ("apart", "roll", "no uncertainty", "added to measured pixels"))
+    assert all(word in printed for word in ("apart", "roll", "added to measured pixels"))
     assert tree["judgement"] in " ".join(printed.split())
-    assert tree["judgement"].startswith("By this the calibration is off by")
+    assert tree["judgement"].startswith("The calibration is off by")
     model = RigModel(slam.open_sequence(WORLD).rig)
     factors = {"left_cx": (model.focal, "px"), "right_f": (100, "%"), "left_k1": (1000, "10⁻³"), "yaw": (1000, "mrad")}
     for row in [row for row in tree["parameters"] if row["name"] in factors]:
         factor, unit = factors[row["name"]]
         shown = f"{factor * row['mean']:.2f} ± {factor * row['sigma']:.2f}"
-        assert re.search(rf"{row['name']} +│ {unit} +│ +{re.escape(shown)} .*± [\d.]+ │\n", printed)  # usual, too
-    expected = corrected_rig(model, np.array([row["mean"] for row in tree["parameters"]])).rig
-    rig = slam.load_rig(folder / "rig.yaml")
-    assert (rig.left, rig.right) == (expected.left, expected.right)
-    np.testing.assert_allclose(rig.T_right_left, expected.T_right_left, atol=1e-9)
+        assert re.search(rf"{row['name']} +{unit} +{re.escape(shown)} .*± [\d.]+ *\n", printed)  # usual, too
 
 
 @pytest.mark.parametrize(
@@ -71,19 +63,6 @@ def test_a_correction_is_advised_only_where_it_is_expected_to_help(off, sigma, a
     assert f"{off:.2f} ± {sigma:.2f} px in disparity" in words and word in words
 
 
-def test_a_recording_that_is_left_out_has_no_numbers(tmp_path, monkeypatch):
-    run = calibrating._run
-
-    def standing(sequence, *given):
-        found, evidence = run(sequence, *given)
-        return found | {"pairs": 0 if "seed=1" in sequence.name else 3}, evidence
-
-    monkeypatch.setattr(calibrating, "_run", standing)
-    printed = command("calibrate", WORLD, f"{WORLD}&seed=1", "--out", tmp_path / "rig.json")
-    assert re.search(r"right_f +│ % +│ [^│]*± [^│]*│ [^│]*± [^│]*│ +– │", printed)
-    assert "left out" in " ".join(printed.split())
-
-
 def test_it_is_the_prior_of_a_run(made, tmp_path):
     folder, _ = made
     file = folder / "rig.json"
@@ -91,7 +70,6 @@ def test_it_is_the_prior_of_a_run(made, tmp_path):
     found = json.loads((tmp_path / "first" / "summary.json").read_text())["self_calibration"]["parameters"]
     expected = json.loads(file.read_text())["parameters"]
     assert [row["mean"] for row in found] == [row["mean"] for row in expected]
-    assert json.loads((tmp_path / "first" / "config.json").read_text())["calibration"] == str(file)
     command("run", WORLD, "--calibration", tmp_path / "first", "--frames", "0:1", "--out", tmp_path / "third", *QUIET)
 
 
@@ -107,7 +85,6 @@ def test_it_is_the_prior_of_a_run(made, tmp_path):
         (["calibrate", WORLD, "--out", "nowhere/rig.json"], "nowhere"),
         (["calibrate", WORLD, "--out", "{rig}"], "is there already"),
         (["calibrate", WORLD, WORLD], "given twice"),  # it would count as two recordings that agree
-        (["calibrate", WORLD, "--out", "a.yaml", "--opencv", "a.yaml"], "same place"),
     ],
 )
 def test_bad_input_is_one_line(made, words, message, tmp_path, monkeypatch):
@@ -115,4 +92,3 @@ def test_bad_input_is_one_line(made, words, message, tmp_path, monkeypatch):
     words = [word.replace("{rig}", str(made[0] / "rig.json")) for word in words]
     with pytest.raises(SlamError, match=message):
         command(*words, "-q")
-    assert not list(tmp_path.glob("*.yaml"))

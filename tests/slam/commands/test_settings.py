@@ -50,8 +50,6 @@ def test_a_setting_of_the_program_itself_is_refused():
             "map.max_landmark=3",
             "did you mean 'max_landmarks'?); known: target_in_view, max_depth_error, restart_after,",
         ),
-        ("map.ratio=3", "unknown key 'ratio'; known: "),  # there are two, which cannot be set
-        ("map.confirm=3", "unknown key 'confirm'; known: "),
         ("association.max_landmarks=3", "did you mean 'map.max_landmarks'?); known: align"),
     ],
 )

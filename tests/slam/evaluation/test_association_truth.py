@@ -25,14 +25,3 @@ def test_pixels_of_the_still_world_are_found_again(boxes):
     assert (points.errors(0, ids, uv + np.array([0, 4.0]))[still] > 3.9).all()
     moved = points.errors(30, ids[still], uv[still])  # the camera moves, so the same pixels show other points
     assert np.median(moved) > 1.0
-
-
-def test_landmarks_that_came_back_are_first_seen_where_they_are_matched(boxes):
-    points, uv = SurfacePoints(boxes), np.array([[20.0, 20.0], [280.0, 40.0]])
-    ids = np.array([3, 8])
-    points.add(0, ids[:1], uv[:1])
-    errors = points.errors(0, ids, uv)
-    assert errors[0] < 1e-6
-    assert np.isnan(errors[1])
-    assert (points.errors(0, ids, uv) < 1e-6).all()
-    assert np.isnan(points.positions(np.array([3, 99]))).all(axis=1).tolist() == [False, True]

@@ -31,10 +31,6 @@ def stretches(frames: int = 100) -> tuple[np.ndarray, np.ndarray]:
     return first, first + 10
 
 
-def test_a_car_that_winds_along_is_believed():
-    assert not doubtful(drive(), NOISE, *stretches()).any()
-
-
 def test_a_drift_to_the_side_is_noticed_where_it_is():
     true, (first, last) = drive(), stretches()
     drift = 0.4 * np.clip((np.arange(100) - 40) / 10, 0, 1)  # 0.4 m, from frame 40 to 50

@@ -97,20 +97,12 @@ def test_rectification_maps_agree_with_opencv():
     np.testing.assert_allclose(rectified_rig.maps[0][1], expected[1], atol=1e-3)
 
 
-def test_fisheye_pair_keeps_a_useful_view():
-    camera = PinholeCamera(190.98, 190.97, 254.9, 256.9, 512, 512, "equidistant", (0.0035, 0.0007, -0.002, 0.0002))
-    rig = StereoRig(camera, camera, se3.so3_exp(np.array([0.0, 0.01, 0.002])), [-0.1, 0.0, 0.0])
-    f = rig.rectified.rig.left.fu
-    assert 0.5 * camera.fu < f < 1.5 * camera.fu
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"b": [0.11, 0, 0]}, "swapped"),
         ({"b": [0, 0, 0]}, "zero"),
         ({"b": [-0.01, 0.2, 0]}, "side by side"),
-        ({"b": [np.nan, 0, 0]}, "finite"),
         ({"R": 2 * np.eye(3)}, "not a rotation"),
         ({"R": np.diag([1.0, 1, -1])}, "not a rotation"),
         ({"right": PinholeCamera(458, 457, 320, 240, 640, 480)}, "one size"),

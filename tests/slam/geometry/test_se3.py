@@ -9,7 +9,6 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from slam.geometry import se3
-from slam.geometry.arrays import narrowed
 
 vectors = arrays(float, 3, elements=st.floats(-3, 3))
 twists = arrays(float, 6, elements=st.floats(-1.7, 1.7))
@@ -70,8 +69,3 @@ def test_left_jacobian(w, d):
     np.testing.assert_allclose(
         se3.so3_exp(w + step), se3.so3_exp(se3.so3_left_jacobian(w) @ step) @ se3.so3_exp(w), atol=1e-10
     )
-
-
-def test_narrowed_numbers_below_the_range_are_zero_where_numpy_is_to_raise():
-    with np.errstate(all="raise"):
-        assert narrowed(np.array([1e-9, 0.5]), np.float16).tolist() == [0.0, 0.5]

@@ -13,6 +13,7 @@ import slam
 from slam.data import StereoFeatures
 from slam.errors import SequenceError
 from slam.geometry.camera import PinholeCamera
+from slam.input import warnings
 from slam.input.pair import pair_geometry, points_of
 from slam.input.warnings import InputWarnings, farthest_apart
 from slam.models import models_for
@@ -299,6 +300,14 @@ def test_images_undistorted_but_not_rectified_before_are_named():
     plain = [replace(camera, model="none", distortion=()) for camera in (DISTORTED.left, DISTORTED.right)]
     said = lines(every(3, seen_by_both(*plain, DISTORTED.R)), rig=DISTORTED)
     assert ["undistorted, and are again" in line for line in said] == [True]
+
+
+def test_a_distortion_that_is_missing_is_named_before_a_rectification_done_twice(monkeypatch):
+    """Raw images with a calibration without their lenses were said to be undistorted twice."""
+    plain = [replace(camera, model="none", distortion=()) for camera in (DISTORTED.left, DISTORTED.right)]
+    monkeypatch.setattr(warnings, "pair_geometry", lambda rig, *given: pair_geometry(DISTORTED, *given))
+    (line,) = lines(every(3), rig=slam.StereoRig(*plain, DISTORTED.R, DISTORTED.b))
+    assert "the lenses' distortion is missing in it; or the images were rectified before" in line
 
 
 def test_equal_lenses_that_the_images_do_have_are_left_in_peace():

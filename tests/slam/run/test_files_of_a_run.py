@@ -50,8 +50,8 @@ def test_rows_are_whole_on_a_full_disk(tmp_path):
     assert (tmp_path / "rows").read_text() == "first\nthird\n"
 
 
-def test_a_disk_that_fills_up_half_way(tmp_path):
-    """Rows before are there, the small last files too, and what failed stands in one line."""
+def test_a_disk_that_fills_up_half_way(tmp_path, caplog):
+    """Rows before are there, and the small last files too; each that failed is said in a line."""
     out = tmp_path / "out"
 
     def fill(frame, result, system):
@@ -59,10 +59,9 @@ def test_a_disk_that_fills_up_half_way(tmp_path):
             hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
             resource.setrlimit(resource.RLIMIT_FSIZE, ((out / "frames.csv").stat().st_size + 10, hard))
 
-    words = r"out: File too large; .*summary\.json: cannot be written: File too large$"
-    with pytest.raises(SlamError, match=words) as caught, disk_of(10**6):
+    with pytest.raises(SlamError, match=r"out: File too large$"), disk_of(10**6):
         run(tmp_path, watches=[fill])
-    assert "\n" not in str(caught.value)
+    assert "summary.json: cannot be written: File too large" in caplog.text
     assert (out / "trajectory.txt").read_text().count("\n") == 4
     assert (out / "frames.csv").read_text().count("\n") == 5
     assert (out / "landmarks.csv").read_text().count("\n") > 1

@@ -43,7 +43,7 @@ def out(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(RunFiles, "write_frame", write_frame)
-        options = RunOptions("ekf", "surf", SystemConfig.for_kind("handheld"), folder, source=WORLD)
+        options = RunOptions("ekf", "surf", SystemConfig.for_kind("handheld"), folder)
         run(open_sequence(WORLD), options)
     return folder
 

@@ -14,7 +14,8 @@ import pytest
 import slam
 from slam.errors import CalibrationError, ConfigurationError, SlamError
 from slam.sequences import open_sequence
-from slam.sequences.rigs import read_rig, write_opencv
+from slam.sequences.rigs import read_rig
+from tests.recordings import write_opencv
 
 SIZE = (64, 48)
 K = np.array([[50.0, 0, 31.5], [0, 51.0, 23.5], [0, 0, 1]])
@@ -159,6 +160,13 @@ def load(tmp_path: Path, name: str, encoding: str = "utf-8", **options) -> slam.
     return slam.load_rig(*(tmp_path / file for file in files), **known)
 
 
+def test_a_lens_of_one_camera_alone_is_refused(tmp_path: Path) -> None:
+    both = {"K1": M, "D1": [-0.3, 0.1, 0, 0], "K2": M, "R": EYE, "T": [-0.2, 0, 0]}
+    (tmp_path / "a.json").write_text(json.dumps(both))
+    with pytest.raises(CalibrationError, match="D2 is missing"):
+        slam.load_rig(tmp_path / "a.json", size=SIZE)
+
+
 @pytest.mark.parametrize("name", FORMS)
 def test_the_same_rig_in_the_words_of_many_programs_and_people(tmp_path: Path, name: str) -> None:
     _, options, distortion = FORMS[name]
@@ -245,12 +253,9 @@ REFUSED = [
     (f"{FIVE}baseline: 0.2\nk1: 0.1\n", "names distortion, but only one camera"),
     ("fx: 0.8\nfy: 0.8\ncx: 0.5\ncy: 0.5\nbaseline: 0.2\n", "a focal length of 0.8 px for images 64 px wide: is it"),
     (f"{FIVE}baseline: 7.9\nunit: inch\n", "unit must be m or cm or mm, got 'inch'"),
-    ("fx: 50\nfy: 50\ncx: .inf\n", "cx is not finite"),
-    (FIVE, "baseline is missing"),
     (f"{FIVE}baseline: -0.12\n", "fx, fy and baseline must be positive"),
     (OAK.replace('"toCameraSocket": 2', '"toCameraSocket": 0'), "depthai's, but says nothing of how the pair stands"),
     (ZED, "it is a ZED's, for images of another size than 64x48; it has 1280x720, 672x376"),
-    (ros_yaml(0), "one camera's: name both files"),
     ('{"rig": {}, "parameters": [], "evidence": null}', "errors of a rig, as `slam calibrate` or a run found them"),
     *((CAMCHAIN.replace(old, new, 1), text) for old, new, text in (
         ("-0.2]", "0.2]", "are the cameras swapped (the first one of a calibration is the left one)"),
@@ -258,8 +263,6 @@ REFUSED = [
         ("camera_model: pinhole", "camera_model: omni", "camera model 'omni' is not supported"),
         ("distortion_model: radtan", "distortion_model: fov", "distortion model 'fov' is not supported"),
         ("[0, 0, 1, 0]", "[0, 0, 2, 0]", "T_cn_cnm1 is not a rigid motion"),
-        ("intrinsics: [50.0, 51.0", "intrinsics: [50.0", "cam0/intrinsics has 3 numbers; it has fx, fy, cx, cy, or"),
-        ("2e-4, 1e-5]", "2e-4]", "takes 4 coefficients or more, got 3"),
     )),
 ]  # fmt: skip
 
@@ -277,12 +280,10 @@ def test_what_a_file_lacks_is_one_line_with_its_name(tmp_path: Path, text: str, 
     ("change", "text"),
     [
         ({"K2": None, "T": None}, "K2, T are missing"),
-        ({"R": None}, "R is missing"),
         ({"R": 2 * np.eye(3)}, "R is not a rotation matrix"),
         ({"K1": np.array([[50.0, 3, 31.5], [0, 51, 23.5], [0, 0, 1]])}, "K1 is no camera matrix"),
         ({"K1": np.eye(3)}, "a focal length of 1 px for images 64 px wide: is it in pixels?"),
         ({"R": np.array([1.0, -2.0, 0.5])}, "the cameras look 126 degrees apart: is a rotation in degrees?"),
-        ({"K1": np.eye(4)}, "K1 has 16 numbers; it has fx, fy, cx, cy, or 3 rows of 3"),
     ],
 )
 def test_faulty_entries(tmp_path: Path, build: SimpleNamespace, change: dict, text: str) -> None:
@@ -299,16 +300,11 @@ def test_what_is_no_calibration_is_one_line(tmp_path: Path, two_folders: Path) -
         (tmp_path / f"{name}.yaml").write_text(camera.format(x=x))
     (tmp_path / "0.yaml").write_text("Image_Size: [64, 48]\nfoo_Bar: 1\n")
     (tmp_path / "1.yaml").write_text("K1: [1]\n")
-    np.savez(tmp_path / "a.npz", K1=K)
     for files, options, words in (
-        (["nowhere.yaml"], {}, r"nowhere\.yaml: the calibration is missing"),
         ([two_folders / "left"], {}, "no calibration under one of the usual names"),
         ([two_folders / "calibration.yaml"], {}, r"names no image size: give size=\(width, height\)"),
         (["a.yaml", "b.yaml"], {"size": (32, 24)}, r"images are 32x24, but .* is for 64x48"),
         (["0.yaml", "1.yaml"], {}, r"in it: Image_Size, K1, foo_Bar"),
-        (["a.npz"], {"size": SIZE}, r"a\.npz: no text: write K1, .* with cv2\.FileStorage"),
-        ([two_folders], {"unit": "inch"}, "unit must be m or cm or mm"),
-        ([], {}, "no calibration is named"),
     ):
         with pytest.raises(SlamError, match=words):
             slam.load_rig(*(tmp_path / file for file in files), **options)

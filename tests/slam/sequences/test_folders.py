@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -64,23 +61,6 @@ def test_names_are_read_as_numbers_and_stamps(two_folders: Path, name: str) -> N
     assert seeds(sequence) == PAIRS
     assert np.allclose(sequence.stamps, first + step * np.arange(6), atol=2e-6, rtol=0)
     assert any("10 frames per second assumed" in w for w in sequence.warnings) == (first == 0)
-
-
-def test_a_guess_is_said_with_what_was_guessed(two_folders: Path) -> None:
-    for form, words in (
-        (lambda i, _: f"img_{i:03d}_{9 - i}", "numbers in the names disagree"),
-        (lambda i, side: "abcdef"[i] + side, "their order does"),
-        (lambda i, _: f"x_{1_700_000_000 + i}.500000", "is taken as 1700000000.500000 s"),
-        (lambda i, _: f"{1_700_000_000}_{50 * i:03d}", "50 apart and taken as frame numbers"),
-        (lambda i, _: f"{33 * i}", "33 apart and taken as frame numbers; if they are times, see times="),
-        (
-            lambda i, _: "preview" if i == 5 else f"{i}",
-            "1 of 6 images are named unlike the others, .*first: preview.png",
-        ),
-    ):
-        for side in ("left", "right"):
-            rename(two_folders / side, lambda i, form=form, side=side: form(i, side[::2]) + ".png")
-        assert any(re.search(words, line) for line in open_sequence(two_folders).warnings), words
 
 
 @pytest.mark.parametrize(
@@ -149,20 +129,10 @@ def test_a_tolerance_and_a_rate_go_with_every_format(two_folders: Path, euroc: P
         with pytest.raises(SequenceError, match=rf"nearest two are 8 ms apart, {allowed} are allowed; see tolerance="):
             open_sequence(f"{two_folders}{query}")
     assert seeds(open_sequence(f"{two_folders}?tolerance=0.02")) == PAIRS
-    assert np.allclose(open_sequence(f"{two_folders}?fps=10").stamps, 0.1 * np.arange(6))
+    assert np.allclose(open_sequence(f"{two_folders}?fps=20").stamps, 0.05 * np.arange(6))
     assert len(open_sequence(f"{euroc}?tolerance=0")) == 6
     for folder in (kitti, euroc):
         assert np.allclose(open_sequence(f"{folder}?fps=5").stamps, 0.2 * np.arange(6))
-
-
-def test_times_and_rate_can_be_told(two_folders: Path) -> None:
-    assert np.allclose(open_sequence(f"{two_folders}?fps=20").stamps, 0.05 * np.arange(6))
-    (two_folders / "t.txt").write_text("".join(f"{7 + 0.3 * i}\n" for i in range(6)))
-    sequence = open_sequence(f"{two_folders}?times=t.txt")
-    assert np.allclose(sequence.stamps, 7 + 0.3 * np.arange(6)) and sequence.warnings == []
-    (two_folders / "t.txt").rename(two_folders / "times.txt")
-    (two_folders / "right" / "right_000.png").unlink()  # the times are those of the left images
-    assert np.allclose(open_sequence(two_folders).stamps, 7 + 0.3 * np.arange(1, 6))
 
 
 # ------------------------------------------------------------------------------------------------ layouts
@@ -323,7 +293,3 @@ def test_a_video_that_ends_too_early(videos: Path, build: SimpleNamespace) -> No
     frames = list(sequence)
     assert 0 < len(frames) < len(sequence)
     assert f"left.avi: ends or is damaged at frame {len(frames)} of 12" in sequence.warnings[-1]
-    code = "import sys; from slam.sequences import open_sequence; print(len(list(open_sequence(sys.argv[1]))))"
-    run = subprocess.run([sys.executable, "-c", code, str(videos)], capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == str(len(frames))
-    assert run.stderr.count("\n") == 1  # our line alone (logging's last resort), none of the decoder's

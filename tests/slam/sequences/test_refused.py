@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import subprocess
-import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,10 +16,8 @@ from slam.sequences import open_sequence
 from slam.sequences.calibration import read_yaml
 
 RIGHT = {"euroc": "mav0/cam1", "kitti": "image_1", "raw": "image_01", "two_folders": "right"}
-CALIBRATION = {
-    "euroc": "mav0/cam1/sensor.yaml", "kitti": "calib.txt", "raw": "../calib_cam_to_cam.txt",
-    "two_folders": "calibration.yaml",
-}  # fmt: skip
+
+
 FORMATS = tuple(RIGHT)
 
 
@@ -36,24 +31,20 @@ def refused(path, error=SlamError, words=None, seconds=1.0):
     return str(caught.value)
 
 
-def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, euroc, raw):
+def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, euroc):
     here = tmp_path / "here"
-    for name in ("empty", "two/left", "two/right", "two/other/a", "deep/a/b/c/left", "deep/a/b/c/right"):
+    for name in ("empty", "two/left", "two/right", "two/other/port", "two/other/starboard"):
         (here / name).mkdir(parents=True)
-    for name in ("text/a.txt", "both.mp4", "sides/0.png", *(f"cams/cam{k}.png" for k in range(6))):
+    for name in ("sides/0.png", "both.mp4", *(f"cams/cam{k}.png" for k in range(6))):
         (here / name).parent.mkdir(exist_ok=True)
         (here / name).write_text("x")
     for path, words in {
         "nowhere": "nowhere: there is no such folder",
         "empty": "the folder is empty",
-        "text": "no sequence of a known format",
-        "deep": "below it is a.b.c: give that$",
         "sides": r"where each image holds both cameras: 'sides\?layout=sbs'",
         "cams": "no sequence of a known format",  # numbered images of one camera are no pair
-        "text/a.txt": r"a\.txt: a file where the sequence's folder should be; give the folder",
         "both.mp4": r"folder should be; a video .* is .*both\.mp4\?layout=sbs",
-        "two/other": "by other names",
-        kitti / "image_0": rf"give {kitti} .format kitti",
+        "two/other": r"by other names: .other\?left=port&right=starboard",
         euroc / "mav0/cam0/data": rf"give {euroc}(/mav0)? .format euroc",
         kitti.parent.parent: r"no sequence of a known format .*; below it is sequences.03: give that$",
     }.items():
@@ -64,17 +55,12 @@ def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, eur
     ("query", "error", "words"),
     [
         ("left=nowhere", SequenceError, "there is no such folder or video"),
-        ("left=a%00b&right=c", ConfigurationError, "NUL"),
         ("calibration=nowhere.yaml", CalibrationError, "the calibration is missing"),
-        ("calibration=/dev/zero", CalibrationError, None),
-        ("times=/dev/zero", SequenceError, None),
         ("times=t.txt&fps=3", ConfigurationError, "'fps' does nothing here"),
-        ("tolerance=0.1", ConfigurationError, "'tolerance' does nothing here"),
-        ("fps=3&kind=driving&fps=30", ConfigurationError, "an option is given twice: fps=3"),
+        ("fps=3&kind=driving&fps=30", ConfigurationError, "option 'fps' is given twice"),
         ("fps=0", ConfigurationError, "fps must be a number from 0.001"),
         ("rectified=yes", CalibrationError, "P1, P2 are missing"),
         ("speed=3", ConfigurationError, "unknown option 'speed' of format folders; known: calibration, fi"),
-        ("&".join(f"a{i}=1" for i in range(1000)), ConfigurationError, "more than 100 options"),
         ("mask=black.png", ConfigurationError, "black all over"),
         ("mask=small.png", ConfigurationError, "another size"),
     ],
@@ -100,23 +86,6 @@ def test_a_right_camera_that_is_none(fixture, request, build):
     assert str(folder) in refused(folder, SequenceError, "two cameras are needed")
     right.write_text("hello")
     refused(folder, SequenceError, r"a file where a folder|two cameras are needed")
-
-
-@pytest.mark.parametrize("fixture", FORMATS)
-def test_a_calibration_that_is_none(fixture, request):
-    folder: Path = request.getfixturevalue(fixture)
-    path = folder / CALIBRATION[fixture]
-    text = path.read_text()
-    for content in (b"", b"hello", b"\x00\xff\xfe" * 50, b"K1: [1, 2", b"%YAML:1.0\n---\nK1: 3\n"):
-        path.write_bytes(content)
-        assert path.name in refused(folder, CalibrationError)
-    number = next(n for n in ("50.0,", "5.000000e+01", "50.") if n in text)
-    dot, comma = "." * (path.suffix == ".yaml"), "," * number.endswith(",")
-    for word in (f"{dot}nan", f"{dot}inf", "9" * 400, "9" * 5000, "1e400", "1e300"):
-        path.write_text(text.replace(number, word + comma, 1))
-        assert path.name in refused(folder, CalibrationError, "not finite|impossibly large")
-    path.unlink()
-    assert str(folder.parent) in refused(folder, CalibrationError, "calibration is missing")
 
 
 def test_calibrations_of_other_cameras(euroc, kitti, raw, two_folders, build):
@@ -148,11 +117,7 @@ def test_images_that_never_pair(euroc, kitti, two_folders, build):
     refused(two_folders, SequenceError, r"left has 5 images and .*right has 6")
 
 
-def test_yaml_names_the_row_that_an_editor_shows_and_nothing_is_executed(tmp_path):
-    for first in ("%YAML:1.0\n---", "%YAML 1.1\n---", "---\n# a comment"):
-        (tmp_path / "a.yaml").write_text(f"{first}\nx: 1\ny: }}\nz: 3\n")
-        with pytest.raises(CalibrationError, match=r"a\.yaml, row 4: no valid YAML"):
-            read_yaml(tmp_path / "a.yaml")
+def test_nothing_in_yaml_is_executed(tmp_path):
     (tmp_path / "a.yaml").write_text(f"x: !!python/object/apply:os.mkdir [{tmp_path / 'made'}]\n")
     assert list(read_yaml(tmp_path / "a.yaml")) == ["x"]
     assert not (tmp_path / "made").exists()
@@ -206,29 +171,6 @@ def test_listed_images_that_are_missing_and_stamps_that_differ_a_little(euroc: P
     for cam, i in (("cam0", 1), ("cam1", 3)):
         assert f"{cam}/data.csv: 1 of 6 listed images are missing (first: {stamps[i]}.png)" in text
     assert f"1 image without a partner in {euroc / 'mav0' / 'cam1' / 'data'} (first: {stamps[3]}.png)" in text
-
-
-def test_a_long_sequence_is_opened_and_read_in_constant_memory(kitti: Path) -> None:
-    """300 images of 0.5 MB, linked to one file: the peak while iterating stays far below their sum."""
-    big = kitti.parent / "big.png"
-    cv2.imwrite(str(big), np.random.default_rng(0).integers(0, 255, (700, 700)).astype(np.uint8))
-    for number in (0, 1):
-        for i in range(300):
-            path = kitti / f"image_{number}" / f"{i:06d}.png"
-            path.unlink(missing_ok=True)
-            os.link(big, path)
-    (kitti / "times.txt").write_text("".join(f"{0.1 * i}\n" for i in range(300)))
-    code = (
-        "import resource, sys; from slam.sequences import open_sequence; import cv2\n"
-        "sequence = open_sequence(sys.argv[1])\n"
-        "for frame in sequence.frames(0, 3): pass\n"
-        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-        "for frame in sequence.frames(0, 60): pass\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)\n"
-    )
-    pytest.importorskip("resource")
-    run = subprocess.run([sys.executable, "-c", code, str(kitti)], capture_output=True, text=True, check=True)
-    assert int(run.stdout) < 15_000  # kilobytes; 60 frames more of two images each would be 58 000
 
 
 @pytest.mark.parametrize(

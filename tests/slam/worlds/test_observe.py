@@ -47,44 +47,6 @@ def test_frames_are_the_same_in_any_order_and_differ_by_seed():
         assert f.stamp == a.stamps[k]
 
 
-def test_chances_of_detection_and_of_stereo_matches():
-    sequence = open_world("box?detect=0.6&stereo=0.7&outliers=0")
-    detected = visible = matched = matchable = 0
-    for k in range(0, 300, 3):
-        seen, truth = sequence.simulate(k), visible_landmarks(sequence.world, k)
-        detected, visible = detected + len(seen.ids), visible + len(truth.ids)
-        in_right = truth.in_right[np.searchsorted(truth.ids, seen.ids)]
-        matched += (seen.features.has_stereo & in_right).sum()
-        matchable += in_right.sum()
-    assert visible > 3000
-    assert detected / visible == pytest.approx(0.6, abs=0.03)  # 3 deviations of 0.009
-    assert matched / matchable == pytest.approx(0.7, abs=0.03)
-
-
-def test_share_of_outliers():
-    seen = [open_world("aisle?outliers=0.3").simulate(k) for k in range(0, 1500, 50)]
-    false = np.concatenate([s.ids for s in seen]) < 0
-    assert false.mean() == pytest.approx(0.3, abs=0.02)
-    assert all((s.objects[s.ids < 0] == -1).all() for s in seen)
-    stereo = np.concatenate([s.false_stereo for s in seen])[~false]
-    assert stereo.mean() == pytest.approx(0.15 * 0.95 * 0.8, abs=0.05)  # of those with a match, about 0.8 of all
-
-
-def test_descriptors_find_their_landmark_in_the_next_frame():
-    sequence = open_world("desk?outliers=0&confusion=0&descriptor=16")
-    right = total = 0
-    for k in range(0, 300, 30):
-        a, b = sequence.simulate(k), sequence.simulate(k + 1)
-        distance = np.linalg.norm(a.features.descriptors[:, None] - b.features.descriptors, axis=2)
-        both = np.isin(a.ids, b.ids)
-        right += (b.ids[distance.argmin(axis=1)] == a.ids)[both].sum()
-        total += both.sum()
-    assert np.allclose(np.linalg.norm(a.features.descriptors, axis=1), 1, atol=1e-6)
-    assert a.features.descriptors.dtype == np.float32
-    assert a.features.descriptors.shape[1] == 16
-    assert right / total > 0.99
-
-
 def test_only_what_the_camera_sees_is_visible():
     """Visibility from geometry against the rendered depth: a second way to the same truth."""
     sequence = open_world("boxes?camera=moving&density=200")

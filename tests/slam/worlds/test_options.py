@@ -13,12 +13,9 @@ from slam.errors import SlamError
         ("isle", r"unknown world 'isle' \(did you mean 'aisle'\?\); known: aisle, box, boxes"),
         ("aisle?sead=3", r"world 'aisle' has no option 'sead' \(did you mean 'seed'\?\); known: baseline, .*seed"),
         ("aisle?frames=many", "frames must be a whole number, got 'many'"),
-        ("aisle?frames=-1", r"frames must lie in 1\.\."),
         ("aisle?sigma=nan", "sigma must lie in"),
-        ("aisle?rig=crooked", "rig must be one of rectified, toedin, got 'crooked'"),
         ("aisle?seed=1&seed=2", "'seed' is given twice"),
         ("aisle?black=often", "black must be frames"),
-        ("aisle?black=1.5", r"a chance must lie in 0\.\.1"),
         ("aisle?drop=0:2000", "no frame is left"),
     ],
 )

@@ -97,10 +97,3 @@ def test_rendering_twice_gives_the_same_bytes_whatever_the_order_and_the_threads
         assert np.array_equal(frame.right, in_sequence[2].right)
     assert (alone.index, alone.stamp) == (22, in_sequence[2].stamp)
     assert alone.left.dtype == np.uint8 and alone.left.shape == (240, 320)
-
-
-def test_no_pixel_of_a_room_is_without_a_surface():
-    for query in ("aisle", "desk", "boxes"):
-        sequence = open_world(query)
-        for k in np.linspace(0, len(sequence) - 1, 5).astype(int):
-            assert (sequence.depth(k) > 0).all(), query
