@@ -31,7 +31,7 @@ from slam.errors import ConfigurationError, SlamError
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend, MapBackend
 from slam.tracker import Elsewhere, State, Tracker
-from slam.tracks.localizer import nowhere
+from slam.tracks.localizer import Search, nowhere
 from slam.tracks.standing import Standing
 from slam.tracks.step import Step
 from slam.tracks.table import Tracks
@@ -81,8 +81,9 @@ class Session:
         saved = state.prior_map
         assert saved is not None
         prediction, place = nowhere(features.stamp, self._config.models.initial_pose), None
-        matches = self._tracker.localizer.match(prediction, saved.rows, saved.positions, features, state.index + 1)
-        T = matches.T_world_left if len(matches) >= self._tracker.localizer.config.minimum_consistent else None
+        localizer, index = self._tracker.localizer, state.index + 1
+        matches = Search(localizer, prediction, saved.rows, saved.positions, features, index).match()
+        T = matches.T_world_left if len(matches) >= localizer.config.minimum_consistent else None
         if T is None:
             place = self._tracker.find(state, features)
             if place is None:

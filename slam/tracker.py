@@ -245,7 +245,7 @@ class Tracker:
         rig_error, backend = self.rig_error, state.backend
         estimate, common = rig_error.added_to(backend, step.estimate), rig_error.common(backend, as_reported=False)
         step = replace(step, estimate=estimate, common=common, correction=self.calibration.applied)
-        return step, self.loop_closer.update(state.atlas, step, state.path)
+        return step, self.loop_closer.update(state.atlas, step)
 
     def roll_back(self, state: State) -> State:
         """The state after an interrupted step: landmarks that only table or back end has go, bodies are forgotten."""

@@ -39,19 +39,21 @@ class HalfImage(NamedTuple):
 
 def half_image(image: NDArray[np.float32], scale: float) -> HalfImage:
     """Halve an image (H, W), brought to 0..255 by `scale`; an odd last row or column is left out."""
-    import cv2
-
     rows, columns = max(image.shape[0] // 2, 1), max(image.shape[1] // 2, 1)
-    flat = np.zeros((3, rows * columns + _LANES), np.float32)
-    pixels, weight, between = (plane[: rows * columns].reshape(rows, columns) for plane in flat)
+    planes = np.zeros((3, rows * columns + _LANES), np.float32)
     if min(rows, columns) >= _SIDE:
-        image, mean = image[: 2 * rows] if scale == 1 else np.float32(scale) * image[: 2 * rows], cv2.INTER_AREA
-        cv2.resize(image[:, : 2 * columns], (columns, rows), pixels, interpolation=mean)
-        between[:, :-1] = cv2.resize(image[:, 1 : 2 * columns - 1], (columns - 1, rows), interpolation=mean)
-        between[:, -1] = 0.25 * (image[::2, 2 * columns - 1] + image[1::2, 2 * columns - 1])
-        between[:, -1] += 0.25 * (image[::2, -1] + image[1::2, -1])
-        _weigh(pixels, np.empty((2, columns), np.float32), weight)
-    return HalfImage((rows, columns), *flat)
+        _halve(image, np.float32(0.25 * scale), rows, columns, planes)
+    return HalfImage((rows, columns), *planes)
+
+
+@vector_helper
+def _means(upper, lower, share, width, pixels, between, to):
+    """Means of the 2x2 pixels of two rows, each times `share`, and of those half a column further to the right."""
+    for x in range(width):
+        j, k = np.uint64(2 * x), to + np.uint64(x)
+        inner = upper[j + np.uint64(1)] + lower[j + np.uint64(1)]
+        pixels[k] = share * (upper[j] + lower[j] + inner)
+        between[k] = share * (inner + upper[j + np.uint64(2)] + lower[j + np.uint64(2)])
 
 
 @vector_helper
@@ -69,7 +71,6 @@ def _column_sums(pixels, y, sums):
 
 @vector_helper
 def _row_weights(sums, weight, y):
-    """Weights of a row from the column sums of its patches."""
     area, zero = np.float32(_SIDE * _SIDE), np.float32(0.0)
     least = np.float32(_FLAT * _FLAT) * area
     for x in range(sums.shape[1] - 2 * _HALF):
@@ -82,9 +83,19 @@ def _row_weights(sums, weight, y):
 
 
 @kernel
-def _weigh(pixels, sums, weight):
-    """The weights of a `HalfImage`; `sums` is work space."""
-    for y in range(_HALF, len(pixels) - _HALF):
+def _halve(image, share, rows, columns, planes):
+    """Fill in the planes of a `HalfImage` of so many rows and columns; `share` is a quarter of the scale."""
+    pixels, weight, between = planes[0], planes[1], planes[2]
+    size, sums = rows * columns, np.empty((2, columns), np.float32)
+    for y in range(rows):
+        upper, lower, last = image[2 * y], image[2 * y + 1], (y + 1) * columns - 1
+        _means(upper, lower, share, columns - 1, pixels, between, np.uint64(y * columns))
+        x, end = 2 * columns - 1, image.shape[1] - 1  # beyond an even width the last column counts again
+        inner = upper[x] + lower[x]
+        pixels[last] = share * (upper[x - 1] + lower[x - 1] + inner)
+        between[last] = share * (inner + upper[end] + lower[end])
+    pixels, weight = pixels[:size].reshape(rows, columns), weight[:size].reshape(rows, columns)
+    for y in range(_HALF, rows - _HALF):
         _column_sums(pixels, y, sums)
         _row_weights(sums, weight, y)
 

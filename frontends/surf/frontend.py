@@ -128,7 +128,6 @@ class SurfFrontend:
         return cv2.remap(image, columns, rows, cv2.INTER_LINEAR)
 
     def _rectified_mask(self, mask: NDArray | None) -> NDArray | None:
-        """The mask of a frame in the rectified left image."""
         if mask is None:
             return None
         if mask.shape != (self.rig.height, self.rig.width):
@@ -148,7 +147,6 @@ class SurfFrontend:
         return keypoints, threshold
 
     def _spread(self, keypoints: Keypoints, limit: int) -> Keypoints:
-        """At most `limit` features, spread over the image."""
         return keypoints.select(spread(keypoints.uv, limit, _GRID, (self.rig.width, self.rig.height)))
 
     def _match(self, left: Picture, right: Picture, uv: NDArray, size: NDArray) -> NDArray[np.float64]:

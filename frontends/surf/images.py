@@ -50,7 +50,7 @@ class Picture:
 
 
 def grey(image: NDArray, what: str = "image") -> NDArray:
-    """A grey image (H, W), C-contiguous and writeable, from one in grey, BGR or BGRA of any layout.
+    """A grey image (H, W), C-contiguous, from one in grey, BGR or BGRA of any layout.
 
     Raises SequenceError, a line that begins with `what`, where it is no array (H, W), (H, W, 3|4) of uint8 or uint16.
     """
@@ -65,7 +65,7 @@ def grey(image: NDArray, what: str = "image") -> NDArray:
     channels = image.shape[2] if image.ndim == 3 else 1
     if image.ndim not in (2, 3) or channels not in (1, 3, 4):
         raise SequenceError(f"{what}: shape {image.shape} is not (H, W), (H, W, 3) or (H, W, 4)")
-    native = np.require(image, image.dtype.newbyteorder("="), ["C", "W"])
+    native = np.ascontiguousarray(image, image.dtype.newbyteorder("="))
     if channels == 1:
         return native.reshape(image.shape[:2])
     if native.size == 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +15,6 @@ from slam.atlas.pose_graph import Chain, PoseGraph
 from slam.chi_square import chi_square_limit
 from slam.data import CommonError
 from slam.geometry.se3 import Array, adjoint, inverse
-from slam.geometry.trajectory import Trajectory
 
 _DIMENSIONS = 6  # fixed: mean of χ² of a pose
 #: Largest squared Mahalanobis distance of a loop from the path alone: a number beyond five sigma is as rare. Drift
@@ -27,44 +26,33 @@ _FROM_PATH = chi_square_limit(_DIMENSIONS, 1 - 5.7e-7)
 _AMONG_LOOPS = chi_square_limit(_DIMENSIONS, 1 - 1 / 3000)
 
 
-def close(atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Trajectory], same_view: bool) -> Atlas:
+def close(atlas: Atlas, loop: Loop, rig: CommonError, same_view: bool) -> Atlas:
     """Close a loop that the last keyframe sees, if it agrees with the path and a keyframe shortly before saw the same.
 
-    Else it is refused; one that cannot be judged, too. `path` returns the path in odom so far. With `same_view` the
-    camera sees the same from the same place, which is believed against the path: the covariance of the path between is
-    then as much too small as the two disagree.
+    Else it is refused; one that cannot be judged, too. With `same_view` the camera sees the same from the same place,
+    which is believed against the path: the covariance of the path between is then as much too small as the two
+    disagree. The path is that of the keyframes as estimated at the time.
     """
     given, common = atlas, None if atlas.solved is None else atlas.solved.belief(rig)[0]
     between = any(x.first < loop.second and x.second > loop.first for x in atlas.loops)
-    limit, waiting = _AMONG_LOOPS if between else _FROM_PATH, replace(atlas, pending=loop, confirmed=False)
+    limit = _AMONG_LOOPS if between else _FROM_PATH
 
-    def without_it(atlas: Atlas, revised: Trajectory | None) -> tuple[Chain, PoseGraph, float]:
-        """The path as estimated at the time or `revised`, the graph without the loop, the loop's distance from it."""
-        chain = atlas.chain(rig, revised)
-        graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain.poses), loop.pair, common)
-        return chain, graph, disagreement(graph, loop)
-
-    def aside(chain: Chain, graph: PoseGraph, off: float) -> Atlas | None:
-        """The atlas if the loop waits for another one, or adds nothing; None if it is to be closed."""
-        if not _agree(chain, given.pending, loop):
-            return waiting.with_inactive_loop(loop)
-        known = off <= limit and given.loops and not is_informative(graph, loop)
-        return replace(waiting, confirmed=True).with_inactive_loop(loop) if known else None
+    def without_it(atlas: Atlas) -> tuple[Chain, PoseGraph]:
+        """The path, and the graph without the loop."""
+        chain = atlas.chain(rig)
+        return chain, PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain.poses), loop.pair, common)
 
     try:
-        found = without_it(atlas, None)  # the revised path is dear in some back ends, and most loops need none
-        if found[2] <= limit and (done := aside(*found)) is not None:
-            return done
-        revised = path()
-        chain, graph, off = without_it(atlas, revised)
+        chain, graph = without_it(atlas)
+        off = disagreement(graph, loop)
         if off > limit and not (same_view and np.isfinite(off)):
             return _refused(atlas, chain, loop, rig)
-        if (done := aside(chain, graph, off)) is not None:
-            return done
-        atlas = replace(waiting, confirmed=True)
+        atlas = replace(atlas, pending=loop, confirmed=_agree(chain, given.pending, loop))
+        if not atlas.confirmed or (off <= limit and atlas.loops and not is_informative(graph, loop)):
+            return atlas.with_inactive_loop(loop)
         if off > limit:
             atlas = atlas.inflated(loop.first, loop.second, off / _DIMENSIONS)
-            chain, graph, _ = without_it(atlas, revised)
+            chain, graph = without_it(atlas)
         # one that was the first may be farther off the path than those that came after it
         limits = np.where(graph.disagreement() > _AMONG_LOOPS, _FROM_PATH, _AMONG_LOOPS)
         graph = graph.with_loop(loop)

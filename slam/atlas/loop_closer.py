@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +16,6 @@ from slam.data import BoolArray, Correction, IdArray, StereoFeatures
 from slam.geometry.arrays import narrowed
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
-from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import match_everywhere
@@ -61,8 +59,8 @@ class LoopCloser:
         association = replace(association, wide_hypotheses=_HYPOTHESES, consistency_sigmas=lax)
         self._localizer = Localizer(self._rig, association, models)
 
-    def update(self, atlas: Atlas, step: Step, path: Callable[[], Trajectory]) -> Atlas:
-        """The atlas after a frame; `path` returns the path in odom so far."""
+    def update(self, atlas: Atlas, step: Step) -> Atlas:
+        """The atlas after a frame."""
         begins = not len(atlas) or len(atlas.gaps) > atlas.restarts
         wanted = begins or (not step.tracking.unmeasured and self._is_keyframe(atlas, step))
         if not (self._enabled and wanted):
@@ -84,7 +82,7 @@ class LoopCloser:
             return atlas
         loop = max(found, key=lambda loop: loop.inliers)
         same = self._is_same_view(atlas, loop, step.features)
-        return close(atlas, loop, step.common, path, same)
+        return close(atlas, loop, step.common, same)
 
     def find(self, atlas: Atlas, features: StereoFeatures, correction: Correction | None, seed: int) -> Found | None:
         """Find a camera that may be anywhere by the keyframes; None if no place fits or several do.

@@ -11,7 +11,7 @@ from slam.atlas.keyframes import Keyframe, Loop, covariance_growth
 from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig, measurement_rows
 from slam.geometry.se3 import Array, points_by_pose
-from slam.tracks.localizer import Localizer, nowhere
+from slam.tracks.localizer import Localizer, Search, nowhere
 from slam.tracks.table import LandmarkTable
 from slam.window.problem import Rows, Window
 from slam.window.solver import linearised, solve
@@ -27,7 +27,7 @@ def verify(
     """
     points = keyframe.points.astype(float)
     landmarks = replace(keyframe_landmarks(keyframe), ids=np.arange(len(points)))
-    found = localizer.match(nowhere(features.stamp, np.eye(4)), landmarks, points, features, seed)
+    found = Search(localizer, nowhere(features.stamp, np.eye(4)), landmarks, points, features, seed).match()
     if found.T_world_left is None or len(found) < AtlasConfig.inliers:
         return None
     ids, seen = found.ids, found.rows

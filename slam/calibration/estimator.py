@@ -171,15 +171,17 @@ class SelfCalibration:
             return
         self._looked = T_world_left
         view = View.of(self.model, features, T_world_left, _MOST_FEATURES)
-        if len(view) < self.config.minimum_common:
+        if (count := len(view.points)) < self.config.minimum_common:
             return
         # 250: features of a frame whose rows are used: more add little
-        some = np.linspace(0, len(view) - 1, min(len(view), 250)).astype(int)
+        some = np.linspace(0, count - 1, min(count, 250)).astype(int)
         rows, fields = row_evidence(self.model, view.points[some], view.vertical[some], self._own.mean)
         self._rows.add(rows)
         self._fields = fields if self._fields is None else self._fields + fields
+        pairs, part = self.pairs, self._open
         self._compare(view)
-        if self.pairs or self._open is not None:
+        # By rows alone the posterior would change little: it follows what motion shows.
+        if self.pairs > pairs or (self._open is not part and (self.pairs or self._open is not None)):
             self._update()
 
     def _has_turned(self, T_world_left: Array) -> bool:
@@ -195,11 +197,11 @@ class SelfCalibration:
         c, waiting = self.config, self._waiting
         with_last = match(waiting[-1], view) if waiting else None
         # 0.5: a new view is taken when the last one has lost this share of the features it may lose
-        apart = with_last is None or len(with_last) < (1 - 0.5 * (1 - c.kept_share)) * len(waiting[-1])
+        apart = with_last is None or len(with_last) < (1 - 0.5 * (1 - c.kept_share)) * len(waiting[-1].points)
         ended = 0
         for first in waiting:
             matched = with_last if with_last is not None and first is waiting[-1] else match(first, view)
-            if len(matched) > max(c.kept_share * len(first), c.minimum_common):
+            if len(matched) > max(c.kept_share * len(first.points), c.minimum_common):
                 break
             ended += 1
             evidence = self._evidence(first, view, matched) if len(matched) >= c.minimum_common else None

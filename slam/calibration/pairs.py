@@ -38,9 +38,6 @@ class View:
     features: StereoFeatures
     T_world_left: Array  # pose of the rectified left camera (4, 4) as the system has it
 
-    def __len__(self) -> int:
-        return len(self.points)
-
     @classmethod
     def of(cls, model: RigModel, features: StereoFeatures, T_world_left: Array, most: int) -> View:
         """Of the strongest features, `most` at the most, in rectified pixels."""

@@ -17,7 +17,6 @@ import typer
 
 from slam.commands.ending import catch_signals, one_line_errors, whole_frames
 from slam.registry import ONLINE
-from slam.runtime.memory import require_address_space
 
 app = typer.Typer(
     help="Stereo SLAM with modified SURF features and interchangeable back ends.",
@@ -74,7 +73,6 @@ def main() -> None:
         handler.setFormatter(logging.Formatter("slam: %(message)s"))
         notes.addHandler(handler)
         notes.propagate = False  # that kernels are compiled is no warning
-        require_address_space()
         app(prog_name="slam")
 
 
@@ -302,6 +300,18 @@ def render_command(
         root = write_euroc(opened, out, start, stop, tell)
     if not quiet:
         print(f"Files: {root}")
+
+
+@app.command("view", short_help="Show a finished run in Rerun.")
+def view_command(
+    folder: Annotated[Path, argument("Left by `slam run`.", "DIR")],
+    target: Annotated[str, option("A window, or a file.", "live|FILE.rrd", "--to")] = "live",
+    overwrite: _Overwrite = False,
+) -> None:
+    """Show a finished run in Rerun: path, objects and map; `slam run --viewer` shows its images, too."""
+    from slam.run.viewer import view_run
+
+    view_run(folder, target, overwrite)
 
 
 @app.command("list", short_help="List back ends, sequences and formats.")

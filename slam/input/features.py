@@ -11,6 +11,7 @@ import numpy as np
 from slam.checks import LATEST_STAMP, unit_doubt
 from slam.data import BoolArray, Estimate, FrameResult, ImagePair, Observations, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError
+from slam.geometry.arrays import median
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse
 from slam.geometry.trajectory import Trajectory
@@ -49,8 +50,9 @@ def documented(features: Any, rig: StereoRig) -> StereoFeatures:
     u, v = columns["uv_left"].T
     if not features.rectified and np.mean([*(v >= size[1]), False]) > _SHARE and (u < size[1]).all():
         raise MeasurementError("features: uv_left lies below the image: are its columns, x and y, exchanged?")
-    length = float(np.median([*np.linalg.norm(columns["descriptors"].astype(float), axis=1), 1.0]))
-    if columns["descriptors"].any() and abs(length - 1) > _SHARE:
+    looks = columns["descriptors"].astype(float)
+    length = median(np.sqrt(np.einsum("nd,nd->n", looks, looks))) if looks.any() else 1.0
+    if abs(length - 1) > _SHARE:
         raise MeasurementError(
             f"features: descriptors must be unit vectors; the median of their lengths is {length:.3g}"
         )
@@ -97,7 +99,6 @@ def following(features: StereoFeatures, dimensions: int | None, after: float) ->
 
 
 def _number(name: str, value: Any) -> float:
-    """A real number as a float."""
     if isinstance(value, Real) and not isinstance(value, bool):
         try:
             return float(value)
@@ -119,7 +120,7 @@ def _column(name: str, array: Any, rows: int) -> Array:
     if array.dtype != dtype:
         with np.errstate(over="ignore"):  # reported as not finite
             array = (np.sign(array) if "i" in kinds else array).astype(dtype)
-    if np.isinf(array).any() or (name != "uv_right" and np.isnan(array).any()):
+    if (np.isinf(array) if name == "uv_right" else ~np.isfinite(array)).any():
         raise MeasurementError(f"features: a value of {name} is not finite")
     return np.asarray(array)
 

@@ -97,7 +97,6 @@ class InputWarnings:
             )
 
     def _check_texture(self, image: np.ndarray, features: int) -> None:
-        """Warn if images show nothing for several frames."""
         self._poor = self._poor + 1 if features < ENOUGH_FEATURES else 0
         if self._poor >= _POOR:
             self._texture_warned = True
@@ -109,7 +108,6 @@ class InputWarnings:
             )
 
     def _check_partners(self, features: StereoFeatures) -> None:
-        """Warn if hardly any left feature has a right match, for several frames."""
         stereo = int(features.has_stereo.sum())
         self._unpaired = self._unpaired + 1 if len(features) >= 2 * ENOUGH_FEATURES and stereo < ENOUGH_FEATURES else 0
         if self._unpaired < _POOR:
@@ -248,7 +246,6 @@ def _swapped(found: PairGeometry) -> str:
 
 
 def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
-    """That rows do not agree, and the likely cause: images that were rectified twice, or never."""
     left, right = rig.left, rig.right
     plain = not (left.has_distortion or right.has_distortion or np.abs(rig.R - np.eye(3)).max() > 1e-9)
     if found.turned:
@@ -297,7 +294,8 @@ def shows_something(image: object) -> bool:
     """Whether this is an array of numbers that are not all the same; others the front end refuses."""
     if not isinstance(image, np.ndarray) or image.dtype.kind not in "uif" or not image.size:
         return False
-    return bool(image.min() != image.max())
+    rows = image[len(image) // 2], image  # one nearly always shows something
+    return any(some.min() != some.max() for some in rows)
 
 
 def _points(image: np.ndarray | None, rig: StereoRig) -> Points | None:

@@ -16,11 +16,12 @@ import numpy as np
 
 from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError, one_line, text_of
-from slam.files import require_utf8
+from slam.files import noting_inputs, require_utf8
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, quaternion
 from slam.geometry.trajectory import Trajectory
-from slam.outputs import Output
+from slam.outputs import Output, require_outputs
+from slam.run.run_data import RunData
 from slam.run.schema import body_colour
 from slam.system import StereoSlam
 
@@ -124,6 +125,22 @@ class Viewer:
 def outputs(target: str | None, option: str) -> list[Output]:
     """The file that a `Viewer` writes; none where it opens a window, or there is none."""
     return [] if target in (None, LIVE) else [Output(Path(target), option, makes_folder=True)]
+
+
+def view_run(folder: Path, target: str, overwrite: bool = False) -> None:
+    """Show a finished run from its files: path, where bodies were, and the map at its end; it has no images.
+
+    Raises SlamError where the folder does not hold a finished run, and as `Viewer` does.
+    """
+    with noting_inputs() as inputs:
+        run = RunData.read(folder, folder.name)
+    require_outputs(outputs(target, "--to"), inputs, overwrite)
+    with Viewer(target) as viewer:
+        for number, (stamp, pose) in enumerate(zip(run.online.stamps, run.online.poses)):
+            viewer.show_pose(number, float(stamp), pose)
+        for name, places in run.bodies.items():
+            viewer.log(f"/objects/{name}", viewer.rr.Points3D(places, colors=body_colour(int(name)), radii=0.03))
+        viewer.show_map(run.positions, run.covariances, run.seen_last)
 
 
 def _open(rr: Any, target: str) -> Any:

@@ -158,7 +158,6 @@ class CompileClock(event.Listener):
 
 
 def _is_own(event: Any) -> bool:
-    """A compilation of a kernel or helper of this project?"""
     function = getattr(event.data["dispatcher"], "py_func", None)
     return getattr(function, "__module__", "").startswith(_ROOMS)
 
@@ -210,7 +209,6 @@ class _Disjoint(_Helper):
 
 
 def _helper(compiler: type[Compiler] = _Helper, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """A decorator of helpers."""
     options = {**options, **_INNER, "pipeline_class": compiler}
 
     def made(function: Callable[..., Any]) -> Any:

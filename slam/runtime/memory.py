@@ -12,28 +12,10 @@ import os
 import sys
 from functools import cache
 
-from slam.errors import SlamError
-
 _TRIM, _MMAP = -1, -3  # glibc's numbers of these parameters
 _KEPT = 2**27  # bytes at the end of the heap that may be free
 _LARGE = 2**25  # bytes of an array from which it gets pages of its own: the most that glibc takes
 _VARIABLES = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
-
-_LEAST = 2 * 10**9  # bytes of address space: with less, libraries crash or wait for ever while they are loaded
-
-
-def require_address_space() -> None:
-    """Raise SlamError where a limit (``ulimit -v``) leaves too little memory to load the libraries that are needed."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
-    allowed = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if allowed != resource.RLIM_INFINITY and allowed < _LEAST:
-        raise SlamError(
-            f"the process may use {allowed / 1e9:.2g} GB of address space (ulimit -v); at least {_LEAST / 1e9:.2g} GB "
-            "are needed"
-        )
 
 
 @cache

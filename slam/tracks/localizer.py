@@ -32,12 +32,6 @@ class Localizer:
     config: AssociationConfig
     models: EstimatorModels
 
-    def match(
-        self, prediction: Prediction, landmarks: LandmarkTable, positions: Array, features: StereoFeatures, seed: int
-    ) -> LandmarkMatches:
-        """Landmarks whose features agree with one camera pose; for arguments see `Search`, whose `match` it is."""
-        return Search(self, prediction, landmarks, positions, features, seed).match()
-
     def similar_view(self, T_world_left: Array, seen_from: Array, positions: Array) -> BoolArray:
         """Which landmarks (N,) are seen from a pose (4, 4) at a similar angle and distance as at their first sight.
 
@@ -190,7 +184,6 @@ class Search:
         return self._in_windows(uv[view], innovation, view), len(view)
 
     def _consensus(self, matches: Matches, guess: Array, wide: bool = False) -> PoseConsensus:
-        """The pose on which matches agree."""
         c, rows, rig = self.localizer.config, matches.features, self.localizer.rig
         if wide and len(matches) < c.minimum_consistent:
             return PoseConsensus(guess, np.zeros(len(matches), bool))

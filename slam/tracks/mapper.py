@@ -121,7 +121,6 @@ class Mapper:
         return tracks
 
     def _view(self, backend: Backend, step: Step) -> MapView:
-        """The map as the camera sees it."""
         ids = step.tracks.ids[step.tracks.mapped]
         positions = checked(backend, "positions", backend.positions(ids), n=len(ids))
         T, sigma = step.estimate.T_world_left, self._localizer.models.pixel_sigma
@@ -182,7 +181,6 @@ class Mapper:
         return replace(step, added=step.added.joined(LandmarkMatches(ids, rows)))
 
     def _new_ids(self, count: int) -> IdArray:
-        """Ids that were never used."""
         ids = np.arange(self.next_id, self.next_id + count, dtype=np.int64)
         self.next_id += count
         return ids

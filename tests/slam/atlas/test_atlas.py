@@ -28,7 +28,6 @@ class Odometry:
         self._poses: list[np.ndarray] = []
         self._P = np.diag(np.full(6, 1e-10))
         self._points: dict[int, np.ndarray] = {}
-        self.asked: set[int] = set()  # numbers of poses at which the path was asked for
 
     def predict(self, stamp: float) -> Prediction:
         k = len(self._poses)
@@ -65,7 +64,6 @@ class Odometry:
         return np.array([self._points[i] for i in np.asarray(ids).tolist()]).reshape(-1, 3)
 
     def trajectory(self) -> Trajectory:
-        self.asked.add(len(self._poses))
         return Trajectory(self._truth.stamps[: len(self._poses)], np.array(self._poses))
 
 
@@ -101,7 +99,11 @@ def errors(poses: np.ndarray, truth: Trajectory) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def closed(sequence):
-    return drive(sequence, Odometry(sequence.rig, sequence.ground_truth))
+    odometry = Odometry(sequence.rig, sequence.ground_truth)
+    odometry.trajectory = pytest.fail  # dear in some back ends: loops are judged by the path as it was estimated
+    done = drive(sequence, odometry)
+    del odometry.trajectory
+    return done
 
 
 def first_loop(results: list[FrameResult]) -> int:
@@ -116,9 +118,6 @@ def test_loops_are_closed_where_they_are(closed):
     assert system.atlas.summary()["refused"] <= 1  # a true one may miss the gate by chance; the others stay
     assert system.atlas.summary()["closed"] >= 7
     assert system.atlas.summary()["keyframes"] == sum(r.keyframe for r in results)
-    # In some back ends the path takes long: it is asked for where a loop may be closed, and not for one that waits.
-    judged = {r.index + 1 for r in results if r.loop is not None or r.refused_loop is not None}
-    assert system.atlas.inactive_loops and system.backend.asked - {len(results)} <= judged
 
 
 def test_the_path_is_better(closed, sequence):

@@ -14,7 +14,6 @@ from slam.atlas.keyframes import Keyframe, Loop
 from slam.atlas.pose_graph import Chain, PoseGraph
 from slam.data import CommonError
 from slam.geometry.se3 import Array, exp, inverse
-from slam.geometry.trajectory import Trajectory
 
 LAP, DEPTH = 60, 2.0
 SIGMAS = np.repeat([2e-3, 0.05], 3)  # of a step
@@ -61,8 +60,7 @@ def closed(loops: list[Loop]) -> Atlas:
     for each in loops:
         whole = atlas_of(each.second + 1)
         parts = {name: getattr(whole, name) for name in ("keyframes", "index")}
-        path = Trajectory(0.1 * np.arange(each.second + 1), ODOM[: each.second + 1])
-        kept = close(replace(kept, **parts), each, CommonError(), lambda path=path: path, False)
+        kept = close(replace(kept, **parts), each, CommonError(), False)
     return kept
 
 
@@ -100,8 +98,7 @@ def test_a_loop_that_no_other_joins_is_judged_by_the_path_alone(share, elsewhere
 
     here = off_by(brentq(lambda size: disagreement(graph, off_by(size)) - 32.0, 0.5, 50.0))
     earlier = (Loop(0, 1, inverse(ODOM[0]) @ ODOM[1], np.diag(SURE**2), 50),) if elsewhere else ()
-    path = Trajectory(0.1 * np.arange(63), ODOM[:63])
-    atlas = close(replace(atlas_of(63), loops=earlier), here, CommonError(), lambda: path, False)
+    atlas = close(replace(atlas_of(63), loops=earlier), here, CommonError(), False)
     assert here.pair in [x.pair for x in atlas.loops]
 
 
@@ -131,13 +128,11 @@ def test_a_loop_that_contradicts_another_is_closed_where_all_that_was_seen_agree
         return disagreement(graph, glance(64, 0.0)) - 26.0
 
     off = brentq(between, 0.3, 5.0)
-    whole, path = atlas_of(65), Trajectory(0.1 * np.arange(65), ODOM[:65])
+    whole = atlas_of(65)
     first = replace(whole, loops=(glance(62, off),))
-    alone = close(first, glance(64, 0.0), CommonError(), lambda: path, False)
+    alone = close(first, glance(64, 0.0), CommonError(), False)
     assert alone.refused == ((4, 64),)
-    together = close(
-        first.with_inactive_loop(glance(63, 0.6 * off)), glance(64, 0.0), CommonError(), lambda: path, False
-    )
+    together = close(first.with_inactive_loop(glance(63, 0.6 * off)), glance(64, 0.0), CommonError(), False)
     assert together.refused == ()
     assert {(2, 62), (4, 64)} <= {x.pair for x in together.loops}
 
@@ -154,11 +149,10 @@ def test_false_loops_of_one_place_do_not_outvote_true_ones(number):
 @pytest.mark.parametrize("size", [np.inf, np.nan])
 def test_a_loop_that_cannot_be_judged_is_refused(size, monkeypatch):
     """Numbers beyond computing make the pose graph singular: no reason to end a run."""
-    steps = np.full((81, 6, 6), size)
-    chain, path = Chain(ODOM[:81], steps), Trajectory(0.1 * np.arange(81), ODOM[:81])
+    chain = Chain(ODOM[:81], np.full((81, 6, 6), size))
     monkeypatch.setattr(Atlas, "chain", lambda *_: chain)
     with np.errstate(all="ignore"):
-        after = close(atlas_of(81), loop(80), CommonError(), lambda: path, False)
+        after = close(atlas_of(81), loop(80), CommonError(), False)
         with pytest.raises(np.linalg.LinAlgError):
             PoseGraph.solved(chain, [], ODOM[:81], [20, 80])
     assert after.refused == (loop(80).pair,)

@@ -15,7 +15,7 @@ from slam.errors import SequenceError
 from slam.geometry.camera import PinholeCamera
 from slam.input import warnings
 from slam.input.pair import pair_geometry, points_of
-from slam.input.warnings import InputWarnings, farthest_apart
+from slam.input.warnings import InputWarnings
 from slam.models import models_for
 
 SEQUENCE = slam.open_sequence("synthetic:desk?frames=1")
@@ -241,18 +241,6 @@ def test_a_refused_pair_is_refused_again_and_the_right_one_is_used():
         assert [system.process(frame).located for frame in frames] == [True] * 3 and system.warnings == []
 
 
-def test_a_frame_that_is_extracted_again_has_the_same_features():
-    first, second = slam.open_sequence("synthetic:desk?frames=2")
-    frozen = replace(second, right=first.right)
-    system = slam.StereoSlam(RIG, "surf", "ekf")
-    system.process(first)
-    broken = replace(frozen, left=frozen.left[:, :-1])
-    with pytest.raises(SequenceError, match="left image"):
-        system.process(broken)  # a failed call leaves no trace
-    extract = system._extractor.extract
-    assert [extract(system.frontend, frozen).frame.right is None for _ in range(3)] == [True] * 3
-
-
 @pytest.mark.parametrize(("world", "late"), [("aisle?frames=120", -1), ("aisle?frames=120", 2), ("desk?frames=72", 1)])
 def test_right_images_of_another_moment_are_doubted(world, late):
     """Numbers off by one: the run is tracked, with another scale."""
@@ -326,25 +314,11 @@ def test_rectified_drives_with_the_lens_of_their_cameras_are_named(drive, slam_d
     assert not lines(sequence.frames(0, 5), rig=sequence.rig, kind="driving")
 
 
-def test_a_pair_with_many_partners_is_not_looked_at_again(monkeypatch):
-    """It takes as long as a frame, so that a live run would drop one."""
-    looked = []
-    monkeypatch.setattr("slam.input.warnings.points_of", looked.append)
-    assert lines(every(9), stereo=150) == [] and not looked
-
-
 @pytest.mark.parametrize(("baseline", "doubted"), [(120.0, True), (0.00012, True), (0.006, False), (9.0, False)])
 def test_a_baseline_in_another_unit_is_doubted(baseline, doubted):
     rig = slam.StereoRig.from_pinhole(RIG.left.K, baseline=baseline, size=(320, 240))
     said = InputWarnings(rig, models_for("handheld"), 1.5).lines
     assert [f"{baseline:g} m apart" in line for line in said] == [True] * doubted
-
-
-def test_how_far_frames_may_be_apart_follows_from_view_and_motion():
-    handheld, driving = (farthest_apart(RIG, models_for(kind)) for kind in ("handheld", "driving"))
-    assert driving > handheld
-    # one standard deviation of the turn after that time is half of the view
-    assert 1.0 * np.sqrt(handheld) * handheld == pytest.approx(np.arctan(160 / RIG.left.fu))
 
 
 def test_a_repeated_pattern_is_named_as_the_reason():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slam.config import SystemConfig
-from slam.data import FrameStatus, StereoFeatures
+from slam.data import StereoFeatures
 from slam.geometry import se3
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
@@ -100,22 +100,6 @@ def test_a_shaken_camera_with_sharp_images_is_tracked(backend):
         errors = np.linalg.norm(system.trajectory().positions - np.array(poses)[:, :3, 3], axis=1)
         largest.append(errors.max())
     assert np.median(largest) < 0.03
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_carried_off_to_an_unknown_place_the_map_begins_anew(backend):
-    other = Cloud(150, seed=9)
-    cloud = Cloud(150)
-    system = StereoSlam(RIG, None, backend, config=CONFIG)
-    results = [
-        system.process_features((cloud if k < 20 else other).features(T, k / 30, 0.3)[0])
-        for k, T in enumerate(path(50))
-    ]
-    names = [name for name, _ in states(results)]
-    assert names == ["started", "tracked", "predicted", "lost", "tracked"]
-    first = next(k for k in range(20, 50) if len(results[k].added))
-    assert first == 20 + MAP.restart_after - 1
-    assert all(r.status is FrameStatus.TRACKED for r in results[first + 1 :])
 
 
 def test_what_counts_as_lost():
