@@ -17,9 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg.blas import dsyr2k, dsyrk
 
-from backends.ekf.kernels import lessen
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
 
@@ -178,9 +176,10 @@ class Covariance:
         moved = P[:CAMERA, :CAMERA] @ J.T
         own = positive(0.5 * (moved + moved.T), self.camera.diagonal(), V.shape[1])
         by_shift = shift @ own[:POSE, :POSE]
-        gone = dsyrk(1.0, V[b:], lower=1)
-        gone = dsyr2k(-1.0, P[:POSE, b:].T + 0.5 * by_shift, shift, 1.0, gone, lower=1, overwrite_c=1)
-        lessen(P, b, gone.T)
+        along, gone = (P[:POSE, b:].T + 0.5 * by_shift) @ shift.T, V[b:] @ V[b:].T
+        along += along.T.copy()
+        gone -= along
+        P[b:, b:] -= gone
         positive(P[b:, b:], self.P.diagonal()[b:] + (by_shift * shift).sum(axis=1), V.shape[1])
         P[:CAMERA, :CAMERA] = own
         P[CAMERA:b, :CAMERA] = P[:CAMERA, CAMERA:b].T
@@ -195,7 +194,7 @@ class Covariance:
         """
         by_rig = self.by_rig.copy()
         by_rig[self.numbers(rows).ravel(), -1:] -= change.reshape(-1, 1)
-        nothing = np.zeros((len(self.P), 1)), np.zeros((1, by_rig.shape[1]))
+        nothing = np.zeros((len(self.P), 0)), np.zeros((0, by_rig.shape[1]))
         return replace(self, by_rig=by_rig).corrected(*nothing, np.eye(CAMERA), shift)
 
 

@@ -176,8 +176,6 @@ class FilterState:
 
         What moves them is an error of the rig, the last that is considered, and none of the state's.
         """
-        if not len(ids):
-            return self
         s = self.with_all_of(ids)
         rows, before = s.landmarks.rows_of(ids), s.landmarks
         marks = before.moved(coordinates, rows, coordinates.of(before.anchors[rows], points) - before.c[rows])
