@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.linalg import LinAlgError
 from scipy.linalg.lapack import dpotrf
 
 from backends.ekf.camera import Camera
 from backends.ekf.covariance import CAMERA, POSE
-from backends.ekf.innovation import Innovation, UnsolvableError, Update, Whitened
+from backends.ekf.innovation import Linearisation, Update, Whitened
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray
 from slam.geometry.se3 import Array
@@ -31,7 +32,11 @@ _POSE_SHARE = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """The maximum of the posterior (or one step towards it)."""
+    """What an update makes of the prior.
+
+    Without the transport of the covariance it is the maximum of the posterior, or a step towards it. With it, H leaves
+    out what would measure the gauge, and the two differ by what is of second order in a step.
+    """
 
     whitened: Whitened  # the last innovation, from which the covariance follows
     change: Array  # of the state (n,) from the prior, in the prior's coordinates
@@ -44,7 +49,7 @@ class Posterior:
     @cached_property
     def camera(self) -> Camera:
         """After the update."""
-        return self.whitened.innovation.at.camera_after(self.change)
+        return self.whitened.at.camera_after(self.change)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,31 +59,30 @@ class Gated:
     used: BoolArray  # (M,)
     limits: Array  # of the gate (M,)
     distances: Array  # squared, of the innovations (M,); NaN where none is predicted
-    innovation: Innovation
+    at: Linearisation  # where they are from
 
 
 def gate(update: Update, T: Array | None = None) -> Gated:
     """Test each landmark by itself, with its innovation linearised at the prior, or with the camera at a pose T (4, 4).
 
-    Raises UnsolvableError where S is not positive definite.
+    Raises LinAlgError where S is not positive definite.
     """
-    start = update.at(None if T is None else update.camera.at(T))
-    innovation = start.innovation()
+    at = update.linearised(None if T is None else update.camera.at(T))
     limits = chi_square_limits(np.isfinite(update.z).sum(axis=1), update.measure.models.gate_probability)
-    own = squared_distances(innovation.nu.reshape(-1, 3), _blocks(innovation.S))
+    own = squared_distances(at.nu.reshape(-1, 3), _blocks(at.S))
     if not np.isfinite(own).all():
-        raise UnsolvableError("the predicted innovations are not finite or not positive definite")
-    distances = np.where(np.isfinite(start.z).all(axis=1), own, np.nan)
-    return Gated(np.asarray(distances <= limits), limits, distances, innovation)
+        raise LinAlgError("the predicted innovations are not finite or not positive definite")
+    distances = np.where(np.isfinite(at.z).all(axis=1), own, np.nan)
+    return Gated(np.asarray(distances <= limits), limits, distances, at)
 
 
 def solve(gated: Gated) -> Posterior | None:
     """Solve with what passed the gate and agrees; then once more with what the solution predicts after all.
 
-    None where nothing is left. Raises UnsolvableError where S or the pose's covariance is not positive definite, or the
+    None where nothing is left. Raises LinAlgError where S or the pose's covariance is not positive definite, or the
     new state not finite.
     """
-    found, update = _twice(gated), gated.innovation.at.update
+    found, update = _twice(gated), gated.at.update
     if found is not None:
         faced = update.facing(found.camera.pose)
         if faced.camera is not update.camera:  # the coordinates of its error are nearly singular there
@@ -86,7 +90,7 @@ def solve(gated: Gated) -> Posterior | None:
     if found is not None:
         root = found.whitened.by_pose
         if dpotrf(update.covariance.pose - root.T @ root, lower=1)[1] != 0:
-            raise UnsolvableError("the pose's covariance would not stay positive definite")
+            raise LinAlgError("the pose's covariance would not stay positive definite")
     return found
 
 
@@ -106,7 +110,7 @@ def _agreeing(gated: Gated, used: BoolArray) -> Posterior | None:
     the worst one, until all that is left agrees; None where nothing is left.
     """
     while used.any():
-        found = _iterate(gated.innovation, used)
+        found = _iterate(gated.at, used)
         used = found.used
         excess = found.whitened.distances() / gated.limits
         worst = excess.max()
@@ -122,13 +126,13 @@ def _predicted(found: Posterior, gated: Gated) -> BoolArray:
     The gate tested them at the prior. With X the covariance of w with such a landmark's innovation ν, that given the
     used ones is ``ν − Xᵀ w``, and its covariance ``S − Xᵀ X``.
     """
-    nu, agree = found.whitened.innovation, np.zeros(len(found.used), bool)
-    out = np.flatnonzero(~found.used & nu.at.seen.any(axis=1) & np.isfinite(gated.distances))
+    at, agree = found.whitened.at, np.zeros(len(found.used), bool)
+    out = np.flatnonzero(~found.used & at.seen.any(axis=1) & np.isfinite(gated.distances))
     if len(out):
         numbers = (3 * out[:, None] + np.arange(3)).ravel()
-        X = found.whitened.inverse @ nu.S[found.whitened.rows[:, None], numbers]
-        S = nu.S[numbers[:, None], numbers] - X.T @ X
-        residuals = (nu.nu[numbers] - found.whitened.w @ X).reshape(-1, 3)
+        X = found.whitened.inverse @ at.S[found.whitened.rows[:, None], numbers]
+        S = at.S[numbers[:, None], numbers] - X.T @ X
+        residuals = (at.nu[numbers] - found.whitened.w @ X).reshape(-1, 3)
         agree[out] = squared_distances(residuals, _blocks(S)) <= gated.limits[out]
     return agree
 
@@ -139,23 +143,23 @@ def _blocks(S: Array) -> Array:
     return np.asarray(S.reshape(len(each), 3, len(each), 3)[each, :, each])
 
 
-def _iterate(innovation: Innovation, used: BoolArray) -> Posterior:
-    """An update by some landmarks (mask (M,)), first linearised as that innovation is: Gauss-Newton on the posterior.
+def _iterate(at: Linearisation, used: BoolArray) -> Posterior:
+    """An update by some landmarks (mask (M,)), first linearised as it is there, then at each solution (Gauss-Newton).
 
     Where the first is not linear, the guess is the next place. One iteration is taken as it is: the papers' filter.
     What comes to lie behind the camera counts no more.
     """
-    update, posterior = innovation.at.update, None
+    update, posterior = at.update, None
     for iteration in range(update.iterations):
         if iteration == 1 and update.guess is not None:
-            innovation = update.at(update.camera.at(update.guess)).innovation()
+            at = update.linearised(update.camera.at(update.guess))
         elif posterior is not None:
-            innovation = update.at(posterior.camera, posterior.change[CAMERA:]).innovation()
-        used = used & innovation.at.seen.any(axis=1)
-        whitened = innovation.whitened(used)
-        change = np.delete(whitened.y @ innovation.HP[whitened.rows], np.s_[CAMERA : update.covariance.begin])
+            at = update.linearised(posterior.camera, posterior.change[CAMERA:])
+        used = used & at.seen.any(axis=1)
+        whitened = at.whitened(used)
+        change = np.delete(whitened.y @ at.HP[whitened.rows], np.s_[CAMERA : update.covariance.begin])
         if not np.isfinite(change).all():
-            raise UnsolvableError("the corrected state is not finite")
+            raise LinAlgError("the corrected state is not finite")
         posterior = Posterior(whitened, change)
         if update.iterations == 1 or _linear(posterior):
             break
@@ -165,7 +169,7 @@ def _iterate(innovation: Innovation, used: BoolArray) -> Posterior:
 
 def _linear(found: Posterior) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
-    whitened, now = found.whitened, found.whitened.innovation.at
+    whitened, now = found.whitened, found.whitened.at
     update = now.update
     step = (found.change - now.change)[update.measured]
     seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]

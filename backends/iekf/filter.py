@@ -55,7 +55,7 @@ class InvariantCamera:
         J[:3, 3:] = J[3:, :3] = self.pose[:3, :3].T
         return J
 
-    def world(self) -> Array:
+    def displacement(self) -> Array:
         """See `Camera`: ``ξ_p = δp + p̂ × θ``."""
         W = np.eye(POSE)
         W[:3, 3:] = hat(self.pose[:3, 3])

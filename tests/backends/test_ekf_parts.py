@@ -240,7 +240,7 @@ def test_the_update_is_the_joseph_form(coordinates):
     x = np.concatenate([s.camera.x, marks.c.reshape(-1)])
 
     def predict(change):
-        return update.at(s.camera.moved(change[:12]), change[12:]).z.reshape(-1)
+        return update.linearised(s.camera.moved(change[:12]), change[12:]).z.reshape(-1)
 
     H, nu = jacobian(predict, 0 * x, 1e-5), z.reshape(-1) - predict(0 * x)
     S = H @ P @ H.T + 0.25 * np.eye(36)
@@ -307,7 +307,7 @@ def corrected(s: FilterState, update: Update) -> np.ndarray:
 
 def residuals(s: FilterState, update: Update, change: np.ndarray) -> np.ndarray:
     """Whitened: of the prior, whose covariance is diagonal, and of the measurements."""
-    z = update.at(s.camera.moved(change[:12]), change[12:]).z
+    z = update.linearised(s.camera.moved(change[:12]), change[12:]).z
     prior = change / np.sqrt(np.diag(dense(s.covariance)))
     return np.concatenate([prior, ((update.z - z) / update.sigma).reshape(-1)])
 
@@ -365,12 +365,12 @@ def test_a_coordinate_at_its_limit_has_changed_by_so_much():
     s, update, _ = far_in_depth(0)
     asked = np.zeros(45)
     asked[2] = -2 * s.landmarks.c[0, 2]
-    at = replace(update, camera=replace(s.camera, transports=False)).at(None, asked)
+    at = replace(update, camera=replace(s.camera, transports=False)).linearised(None, asked)
     made = (InverseDepth().moved(s.landmarks.c, asked.reshape(-1, 3)) - s.landmarks.c).reshape(-1)
     assert made[2] > asked[2]
     np.testing.assert_array_equal(at.change[12:], made)
     expected = (update.z - at.z + (at.own @ made.reshape(-1, 3, 1))[:, :, 0]).reshape(-1)
-    np.testing.assert_allclose(at.innovation().nu, expected, atol=1e-9)
+    np.testing.assert_allclose(at.nu, expected, atol=1e-9)
 
 
 def test_what_is_taken_out_was_never_there():
@@ -378,7 +378,7 @@ def test_what_is_taken_out_was_never_there():
     s, update = far_off(1)
 
     def whitened(update: Update, used: np.ndarray) -> Whitened:
-        return gate(update).innovation.whitened(used)
+        return gate(update).at.whitened(used)
 
     every, P = whitened(update, np.ones(12, bool)), dense(s.covariance)
     for gone in ([0], [5], [11], [3, 4, 8]):
@@ -404,10 +404,10 @@ def test_no_linearisation_measures_a_displacement_of_the_world(coordinates, tran
     there = s.camera.at(s.pose @ se3.exp(np.array([0.05, -0.1, 0.02, 0.5, -0.2, 0.3])))
     for camera in (None, there):
         change = 0.02 * rng.standard_normal((12, 3)) * s.landmarks.c
-        at = update.at(camera, change.reshape(-1))
-        H = np.delete(at.innovation().HP, np.s_[CAMERA:HEAD], axis=1)
+        at = update.linearised(camera, change.reshape(-1))
+        H = np.delete(at.HP, np.s_[CAMERA:HEAD], axis=1)
         U = np.zeros((48, 6))
-        U[:6] = np.linalg.inv((s.camera if transports else at.camera).world())
+        U[:6] = np.linalg.inv((s.camera if transports else at.camera).displacement())
         marks = s.landmarks if transports else s.landmarks.moved(coordinates, slice(None), change)
         U[12:] = marks.gauge.reshape(-1, 6)
         np.testing.assert_allclose(H @ U, 0, atol=1e-7)  # [px/m], [px/rad]
