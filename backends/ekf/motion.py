@@ -1,4 +1,4 @@
-"""How the camera moves, for [r, φ, v, ω] and its printed transition (paper B, section 2).
+"""How the camera moves, for [r, φ, v, ω] and its transition (paper B, section 2).
 
 The papers' ``R(φ) = Rz(φz) Ry(φy) Rx(φx)`` (paper B, below Eq. 2) takes camera coordinates to a world whose axes may
 be chosen; it is singular at φy = ±90°. With z forward, y down and the first camera as the world, turning 90° about the
@@ -101,7 +101,7 @@ class EulerCamera:
         return J
 
     def advanced(self, dt: float) -> tuple[EulerCamera, Array, Array]:
-        """See `Camera`: the printed A and W, in pieces through the angles' singularity.
+        """See `Camera`: in pieces through the angles' singularity.
 
         Impulses at the beginning change the velocities, after the first new world, and A carries them on.
         """
@@ -119,7 +119,7 @@ class EulerCamera:
         return camera, J, W
 
     def _transition(self, dt: float) -> tuple[EulerCamera, Array]:
-        """``x ← f(x)`` with the printed A.
+        """``x ← f(x)`` as printed, and A: as printed if the covariance is not transported.
 
         If the covariance is transported, the attitude's error is carried as a turn about the world's axes, not as one
         of the angles φ. The printed transition has constant rates of the angles, which is not the same in another

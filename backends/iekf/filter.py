@@ -6,9 +6,10 @@ stands the body's rate ω. The error of a right-invariant filter is a displaceme
 
     R = Exp(ξ_R) R̂,   p = p̂ + ξ_R × p̂ + ξ_p,   v = v̂ + ξ_R × v̂ + ξ_v,   p_i = p̂_i + ξ_R × p̂_i + ξ_i,   ω = ω̂ + ξ_ω
 
-to first order. In these coordinates the transition and all measurements have derivatives that do not depend on where
-the estimate is in the world, and a displacement of camera and map together, which nothing measures, is the same error
-``ξ_R = δ, ξ_p = ξ_i = t, ξ_v = ξ_ω = 0`` whatever the estimate is. No sequence of linearisations can inform on it.
+to first order. A displacement of camera and map together, which nothing measures, is the same error ``ξ_R = δ,
+ξ_p = ξ_i = t, ξ_v = ξ_ω = 0`` whatever the estimate is, and the transition keeps it: no sequence of linearisations can
+inform on it. The filter is an imperfect one in the terms of Barrau and Bonnabel: the rate ω is no part of the group, so
+other derivatives do depend on the estimate.
 
 The covariance is kept in the state's own coordinates here: ``[δp, θ, δv, δω]`` with ``R = Exp(θ) R̂``, and the
 landmarks' inverse depths, in which a far point's error is Gaussian. They are a linear map of ξ, which depends on the
@@ -109,8 +110,8 @@ class IekfConfig:
     """Options of `IekfBackend`.
 
     Attributes:
-        iterations: most linearisations in an update; 1 is the filter of the literature. More are made only in updates
-            where the first is not linear to within the noise.
+        iterations: most linearisations in an update. More than one are made only where the first is not linear to
+            within the noise.
 
     Raises:
         ConfigurationError: a value is out of its range.

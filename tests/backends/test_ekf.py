@@ -38,6 +38,8 @@ def test_wrong_options_are_refused():
         EkfBackend(RIG, iteration=3)
     with pytest.raises(ConfigurationError, match="landmarks must be one of"):
         EkfBackend(RIG, landmarks="polar")
+    with pytest.raises(ConfigurationError, match="papers=true chooses"):
+        EkfBackend(RIG, papers=True, iterations=2)
 
 
 # --- accuracy ---
