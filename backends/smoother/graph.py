@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -14,9 +16,6 @@ from slam.data import IdArray
 from slam.errors import SlamError
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
 
-#: What gtsam throws when it cannot solve.
-FAILURES = (RuntimeError, ValueError, LookupError)
-
 _ENDLESS = 1e9  # numerics: a lag that no run reaches
 _CAREFUL = 20  # numerics: poses after a failure whose factors are made so that they do not throw
 _FIRM = np.repeat([1e-10, 1e-8], 3)  # numerics: variances [rad²], [m²] with which the first pose is held
@@ -24,6 +23,15 @@ _FIRM = np.repeat([1e-10, 1e-8], 3)  # numerics: variances [rad²], [m²] with w
 
 class SolverError(SlamError):
     """The solver failed; the message is gtsam's, in one line."""
+
+
+@contextmanager
+def solving() -> Iterator[None]:
+    """Around calls of gtsam: what it throws is a SolverError."""
+    try:
+        yield
+    except (RuntimeError, ValueError, LookupError) as error:
+        raise SolverError(f"gtsam: {' '.join(str(error).split())[:200] or type(error).__name__}") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +95,8 @@ class Graph:
             try:
                 problem = GraphProblem(to_graph=inverse(self._to_state))
                 return self._update(s, range(number + 1, s.number + 1), problem), ""
-            except FAILURES as error:
-                why, self.rebuilds = line(error), self.rebuilds + 1
+            except SolverError as error:
+                why, self.rebuilds = str(error), self.rebuilds + 1
                 self._careful = s.number + (self._lag or _CAREFUL)
         if why:
             s = replace(s, landmarks=s.landmarks.without_variables(s.number))
@@ -98,14 +106,11 @@ class Graph:
         """The solution with all anew, linearised `again` so many times more; SolverError where gtsam fails."""
         self.restart()
         oldest, self._careful = self.oldest(s), max(self._careful, s.number + 1)
-        try:
-            self._kind, self._first = _kind(s), s.poses[s.of(oldest)]
-            prior, self._base = held(s, oldest)
-            begin = GraphProblem()
-            begin.factors.add(self._make.prior(oldest, self._first, prior))
-            return self._update(s, range(oldest, s.number + 1), begin, again)
-        except FAILURES as error:
-            raise SolverError(line(error)) from error
+        self._kind, self._first = _kind(s), s.poses[s.of(oldest)]
+        prior, self._base = held(s, oldest)
+        begin = GraphProblem()
+        begin.factors.add(self._make.prior(oldest, s.start if oldest == s.begun else self._first, prior))
+        return self._update(s, range(oldest, s.number + 1), begin, again)
 
     def displaced(self, M: Array) -> None:
         """Follow a displacement M (4, 4) of all that the state has in the world: what is in it is relative."""
@@ -131,16 +136,17 @@ class Graph:
         made = self._tracks.make_smart(problem, s.number < self._careful)
         # Nothing leaves before the newest pose is solved for: what leaves fixes where its neighbours are linearised.
         now: Stamps = dict.fromkeys(problem.values.keys(), float(before))
-        self._solver.update(problem.factors, problem.values, now, problem.removed)
-        slots = self._solver.getISAM2Result().getNewFactorsIndices()
+        with solving():
+            self._solver.update(problem.factors, problem.values, now, problem.removed)
+            slots = self._solver.getISAM2Result().getNewFactorsIndices()
+            for _ in range(again):
+                self._solver.update()
+            self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.stamps)
+            values = self._solver.calculateEstimate()
         for track, place in made:
             track.slot = slots[place]
-        for _ in range(again):
-            self._solver.update()
-        self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.stamps)
         self._tracks.forget(s)
         new = [i for i in numbers if i >= oldest] if self._poses else [s.number]
-        values = self._solver.calculateEstimate()
         poses = self._to_state @ [values.atPose3(pose_key(i)).matrix() for i in range(oldest, s.number + 1)]
         self._poses = dict(zip(range(oldest, s.number + 1), poses))
         points, linearised = (
@@ -150,7 +156,7 @@ class Graph:
         joint = self._joint(list(range(max(oldest, s.number - 1), s.number + 1)))
         spread = np.array([*(self._joint([i]) for i in new[:-1]), joint[-6:, -6:]])
         if not (np.isfinite(poses).all() and np.isfinite(joint).all() and (np.diag(joint) > 0).all()):
-            raise ValueError("the solution is not finite, or a variance not positive")
+            raise SolverError("gtsam: the solution is not finite, or a variance not positive")
         self._number, self._tie = s.number, s.ties[s.of(s.number)]
         return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, joint, spread)
 
@@ -198,8 +204,10 @@ class Graph:
         return known and self._kind == _kind(s) and self._tie is s.ties[s.of(self._number)]
 
     def _joint(self, numbers: list[int]) -> Array:
-        isam, keys = self._solver.getISAM2(), [pose_key(i) for i in numbers]
-        P = isam.marginalCovariance(keys[0]) if len(keys) == 1 else isam.jointMarginalCovariance(keys).fullMatrix()
+        keys = [pose_key(i) for i in numbers]
+        with solving():
+            isam = self._solver.getISAM2()
+            P = isam.marginalCovariance(keys[0]) if len(keys) == 1 else isam.jointMarginalCovariance(keys).fullMatrix()
         A = adjoint(inverse(np.array([self._poses[i] for i in numbers])) @ self._first).reshape(-1, 6)
         P = P + A @ self._base @ A.T
         return np.asarray(0.5 * (P + P.T))
@@ -230,17 +238,10 @@ def minimised(problem: GraphProblem, iterations: int) -> gtsam.Values:
     parameters.setMaxIterations(iterations)
     parameters.setRelativeErrorTol(1e-9)
     parameters.setAbsoluteErrorTol(1e-9)
-    try:
+    with solving():
         before = problem.factors.error(problem.values)
         values = gtsam.LevenbergMarquardtOptimizer(problem.factors, problem.values, parameters).optimize()
         after = problem.factors.error(values)
-    except FAILURES as error:
-        raise SolverError(line(error)) from error
     if not np.isfinite(after) or after > before:
         raise SolverError(f"Levenberg-Marquardt found no solution (error {before:.6g} to {after:.6g})")
     return values
-
-
-def line(error: BaseException) -> str:
-    """What gtsam says, in one line."""
-    return f"gtsam: {' '.join(str(error).split())[:200] or type(error).__name__}"

@@ -257,7 +257,7 @@ def _begun(s: SmootherState, T: Array, covariance: Array, sight: Sight) -> Smoot
     return replace(
         s, begun=number, poses=np.concatenate([s.poses, T[None]]), sights=(*s.sights, sight), ties=(*s.ties, None),
         spread=np.concatenate([s.spread, covariance[None]]), last=np.stack([s.last[0], T]), pair=np.zeros((12, 12)),
-        shared=np.zeros((6, 12)), prior=covariance, turned=T[:3, :3] @ covariance[:3, :3] @ T[:3, :3].T,
+        shared=np.zeros((6, 12)), prior=covariance, start=T, turned=T[:3, :3] @ covariance[:3, :3] @ T[:3, :3].T,
         since=0, inside=True, tie=None,
     )  # fmt: skip
 
