@@ -251,7 +251,7 @@ class LandmarkFilter:
             after = s.corrected(found)
         except LinAlgError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self.name}: {error}")
-        used, w = found.used, found.whitened.w
+        used, w = found.used, found.w
         dof, ids = int(np.isfinite(z[used]).sum()), observations.ids
         return after, UpdateReport(UpdateStatus.OK, "", ids[used], ids[~used], float(w @ w), dof)
 

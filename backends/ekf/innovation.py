@@ -127,10 +127,6 @@ class Linearisation:
     own: Array  # derivatives (M, 3, 3) of what is predicted by each landmark's coordinates, zero for others
     lever: Array  # (M, 3, 6), see the module
 
-    def camera_after(self, change: Array) -> Camera:
-        """The camera after a change of the state (n,) from the prior."""
-        return self.camera.moved(self.J @ (change - self.change)[:CAMERA])
-
     @cached_property
     def _along_the_world(self) -> tuple[Array, Array, Array | None]:
         """H by the pose's error (3M, 6), and B (3M, 6) and A (6, 6 + 3M), which is None where B is zero."""
@@ -167,46 +163,56 @@ class Linearisation:
         S[np.diag_indices(len(S))] += self.update.sigma**2
         return S
 
-    def whitened(self, used: BoolArray) -> Whitened:
-        """The innovation of some landmarks (mask (M,)), whitened. Raises LinAlgError if S is not positive definite."""
+    def solved(self, used: BoolArray) -> Solution:
+        """The update by some landmarks (mask (M,)). Raises LinAlgError if their S is not positive definite."""
         rows = np.flatnonzero(np.repeat(used, 3))
         upper, info = dpotrf(self.S[rows[:, None], rows].T)  # of the transpose, which is in the order that LAPACK wants
         if info != 0:
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
-        return Whitened(self, used, rows, upper_inverse(upper).T)
+        return Solution(self, used, rows, upper_inverse(upper).T)
 
 
 @dataclass(frozen=True, eq=False)
-class Whitened:
-    """The innovation of K landmarks whitened: ``w = L⁻¹ ν``, with ``S = L Lᵀ`` of these alone."""
+class Solution:
+    """The update by K landmarks, linearised somewhere; of them alone are ν, H, and ``S = L Lᵀ`` here."""
 
     at: Linearisation
     used: BoolArray  # which landmarks (M,)
     rows: IndexArray  # their rows (3K,) of the innovation
-    inverse: Array  # L⁻¹ (3K, 3K), lower triangular
+    L_inverse: Array  # (3K, 3K), lower triangular
 
     @cached_property
     def w(self) -> Array:
-        """The whitened innovation (3K,); its square is the NIS ``νᵀ S⁻¹ ν``."""
-        return np.asarray(self.inverse @ self.at.nu[self.rows])
+        """The whitened innovation ``L⁻¹ ν`` (3K,); its square is the NIS ``νᵀ S⁻¹ ν``."""
+        return np.asarray(self.L_inverse @ self.at.nu[self.rows])
 
     @cached_property
     def y(self) -> Array:
         """``S⁻¹ ν`` (3K,)."""
-        return np.asarray(self.w @ self.inverse)
+        return np.asarray(self.w @ self.L_inverse)
+
+    @cached_property
+    def change(self) -> Array:
+        """Of the state (n,) from the prior, in the prior's coordinates: ``K ν = P Hᵀ y``."""
+        return np.delete(self.y @ self.at.HP[self.rows], np.s_[CAMERA : self.at.update.covariance.begin])
+
+    @cached_property
+    def camera(self) -> Camera:
+        """After the update."""
+        return self.at.camera.moved(self.at.J @ (self.change - self.at.change)[:CAMERA])
 
     @cached_property
     def by_pose(self) -> Array:
-        """The whitened innovation's covariance (3K, 6) with the pose."""
-        return np.asarray(self.inverse @ self.at.HP[self.rows, :POSE])
+        """Covariance (3K, 6) of w with the pose."""
+        return np.asarray(self.L_inverse @ self.at.HP[self.rows, :POSE])
 
     def gain_root(self) -> tuple[Array, Array]:
         """V (n, 3K) with ``V Vᵀ = K S Kᵀ``, and L⁻¹ times derivatives (3K, m) of ν by errors of the rig."""
         at, update = self.at, self.at.update
-        V = dtrmm(1.0, self.inverse.T, self.at.HP[self.rows].T, side=1, overwrite_b=1)
+        V = dtrmm(1.0, self.L_inverse.T, at.HP[self.rows].T, side=1, overwrite_b=1)
         by_rig = at.H_times(update.covariance.by_rig[update.numbers])
         by_rig -= np.where(at.seen[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
-        return V, self.inverse @ by_rig[self.rows]
+        return V, self.L_inverse @ by_rig[self.rows]
 
     def distances(self) -> Array:
         """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any.
@@ -214,10 +220,9 @@ class Whitened:
         For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off
         by ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so that the distance is ``y_jᵀ Q_j⁻¹ y_j``.
         """
-        columns = self.inverse.reshape(len(self.inverse), len(self.inverse) // 3, 3).transpose(1, 2, 0)
-        Q = columns @ columns.transpose(0, 2, 1)
+        columns = self.L_inverse.reshape(len(self.rows), len(self.rows) // 3, 3).transpose(1, 2, 0)
         found = np.zeros(len(self.used))
-        found[self.used] = squared_distances(self.y.reshape(-1, 3), Q)
+        found[self.used] = squared_distances(self.y.reshape(-1, 3), columns @ columns.transpose(0, 2, 1))
         if not np.isfinite(found).all():
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
         return found

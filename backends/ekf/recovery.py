@@ -18,8 +18,8 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from backends.ekf.covariance import CAMERA
-from backends.ekf.innovation import Update
-from backends.ekf.solve import Gated, Posterior, gate, solve
+from backends.ekf.innovation import Solution, Update
+from backends.ekf.solve import Gated, gate, solve
 from slam.geometry import se3
 from slam.geometry.se3 import Array
 from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, by_chance
@@ -28,7 +28,7 @@ from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, b
 Search = Callable[[], "Array | None"]
 
 
-def agreement(update: Update, search: Search) -> Posterior | None:
+def agreement(update: Update, search: Search) -> Solution | None:
     """Solve with the prior, or where it fails the pose, that most observations agree with; None where there is none.
 
     Where less than a third of the observations agrees, and as many wrong ones might agree by chance, that agreement is
@@ -57,7 +57,7 @@ def agreement(update: Update, search: Search) -> Posterior | None:
     return found
 
 
-def _restarted(update: Update, search: Search, least: int) -> Posterior | None:
+def _restarted(update: Update, search: Search, least: int) -> Solution | None:
     """At the pose on which landmarks agree, if at least so many do."""
     T = search() if len(update.z) >= least else None
     if T is None:
@@ -74,7 +74,7 @@ def _restarted(update: Update, search: Search, least: int) -> Posterior | None:
     return None
 
 
-def _agreed(gated: Gated) -> Posterior | None:
+def _agreed(gated: Gated) -> Solution | None:
     """What agrees with a prediction, if it is more than might agree by chance at the gate's own level."""
     found = solve(gated)
     used, count = 0 if found is None else int(found.used.sum()), len(gated.used)

@@ -8,15 +8,13 @@ by ``P Hᵀ y``.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg.lapack import dpotrf
 
-from backends.ekf.camera import Camera
 from backends.ekf.covariance import CAMERA, POSE
-from backends.ekf.innovation import Linearisation, Update, Whitened
+from backends.ekf.innovation import Linearisation, Solution, Update
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray
 from slam.geometry.se3 import Array
@@ -28,28 +26,6 @@ from slam.window.gating import squared_distances
 _LINEAR = 1.0
 #: Their errors together may move the pose by this share of its deviations: with a wide prior all have the same sign.
 _POSE_SHARE = 0.25
-
-
-@dataclass(frozen=True, eq=False)
-class Posterior:
-    """What an update makes of the prior.
-
-    Without the transport of the covariance it is the maximum of the posterior, or a step towards it. With it, H leaves
-    out what would measure the gauge, and the two differ by what is of second order in a step.
-    """
-
-    whitened: Whitened  # the last innovation, from which the covariance follows
-    change: Array  # of the state (n,) from the prior, in the prior's coordinates
-
-    @property
-    def used(self) -> BoolArray:
-        """Which landmarks (M,) it is made of."""
-        return self.whitened.used
-
-    @cached_property
-    def camera(self) -> Camera:
-        """After the update."""
-        return self.whitened.at.camera_after(self.change)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +52,7 @@ def gate(update: Update, T: Array | None = None) -> Gated:
     return Gated(np.asarray(distances <= limits), limits, distances, at)
 
 
-def solve(gated: Gated) -> Posterior | None:
+def solve(gated: Gated) -> Solution | None:
     """Solve with what passed the gate and agrees; then once more with what the solution predicts after all.
 
     None where nothing is left. Raises LinAlgError where S or the pose's covariance is not positive definite, or the
@@ -88,13 +64,13 @@ def solve(gated: Gated) -> Posterior | None:
         if faced.camera is not update.camera:  # the coordinates of its error are nearly singular there
             found, update = _twice(gate(faced, faced.guess)), faced
     if found is not None:
-        root = found.whitened.by_pose
+        root = found.by_pose
         if dpotrf(update.covariance.pose - root.T @ root, lower=1)[1] != 0:
             raise LinAlgError("the pose's covariance would not stay positive definite")
     return found
 
 
-def _twice(gated: Gated) -> Posterior | None:
+def _twice(gated: Gated) -> Solution | None:
     """With what passed the gate, and again where the solution predicts more."""
     found = _agreeing(gated, gated.used)
     if found is not None:
@@ -103,7 +79,7 @@ def _twice(gated: Gated) -> Posterior | None:
     return found
 
 
-def _agreeing(gated: Gated, used: BoolArray) -> Posterior | None:
+def _agreeing(gated: Gated, used: BoolArray) -> Solution | None:
     """Solve with some landmarks (mask (M,)), and take out what the other measurements contradict, the worst first.
 
     A wrong match spoils the tests of its neighbours, so a round takes out only landmarks at least half as far off as
@@ -112,7 +88,7 @@ def _agreeing(gated: Gated, used: BoolArray) -> Posterior | None:
     while used.any():
         found = _iterate(gated.at, used)
         used = found.used
-        excess = found.whitened.distances() / gated.limits
+        excess = found.distances() / gated.limits
         worst = excess.max()
         if worst <= 1:
             return found if used.any() else None
@@ -120,19 +96,19 @@ def _agreeing(gated: Gated, used: BoolArray) -> Posterior | None:
     return None
 
 
-def _predicted(found: Posterior, gated: Gated) -> BoolArray:
+def _predicted(found: Solution, gated: Gated) -> BoolArray:
     """Which landmarks (mask (M,)) that a solution does not use lie within the gate of what it predicts of them.
 
     The gate tested them at the prior. With X the covariance of w with such a landmark's innovation ν, that given the
     used ones is ``ν − Xᵀ w``, and its covariance ``S − Xᵀ X``.
     """
-    at, agree = found.whitened.at, np.zeros(len(found.used), bool)
+    at, agree = found.at, np.zeros(len(found.used), bool)
     out = np.flatnonzero(~found.used & at.seen.any(axis=1) & np.isfinite(gated.distances))
     if len(out):
         numbers = (3 * out[:, None] + np.arange(3)).ravel()
-        X = found.whitened.inverse @ at.S[found.whitened.rows[:, None], numbers]
+        X = found.L_inverse @ at.S[found.rows[:, None], numbers]
         S = at.S[numbers[:, None], numbers] - X.T @ X
-        residuals = (at.nu[numbers] - found.whitened.w @ X).reshape(-1, 3)
+        residuals = (at.nu[numbers] - found.w @ X).reshape(-1, 3)
         agree[out] = squared_distances(residuals, _blocks(S)) <= gated.limits[out]
     return agree
 
@@ -143,40 +119,39 @@ def _blocks(S: Array) -> Array:
     return np.asarray(S.reshape(len(each), 3, len(each), 3)[each, :, each])
 
 
-def _iterate(at: Linearisation, used: BoolArray) -> Posterior:
+def _iterate(at: Linearisation, used: BoolArray) -> Solution:
     """An update by some landmarks (mask (M,)), first linearised as it is there, then at each solution (Gauss-Newton).
 
     Where the first is not linear, the guess is the next place. One iteration is taken as it is: the papers' filter.
-    What comes to lie behind the camera counts no more.
+    What comes to lie behind the camera counts no more. Without the transport of the covariance this ends at the maximum
+    of the posterior. With it H leaves out what would measure the gauge, and the end is off that by what is of second
+    order in a step.
     """
-    update, posterior = at.update, None
+    update, found = at.update, None
     for iteration in range(update.iterations):
         if iteration == 1 and update.guess is not None:
             at = update.linearised(update.camera.at(update.guess))
-        elif posterior is not None:
-            at = update.linearised(posterior.camera, posterior.change[CAMERA:])
+        elif found is not None:
+            at = update.linearised(found.camera, found.change[CAMERA:])
         used = used & at.seen.any(axis=1)
-        whitened = at.whitened(used)
-        change = np.delete(whitened.y @ at.HP[whitened.rows], np.s_[CAMERA : update.covariance.begin])
-        if not np.isfinite(change).all():
-            raise LinAlgError("the corrected state is not finite")
-        posterior = Posterior(whitened, change)
-        if update.iterations == 1 or _linear(posterior):
+        found = at.solved(used)
+        if not np.isfinite(found.change).all() or np.abs((found.change - at.change)[3:6]).max() > np.pi:
+            raise LinAlgError("a step is not finite, or turns the camera by more than half a turn")
+        if update.iterations == 1 or _linear(found):
             break
-    assert posterior is not None  # there is one iteration at least
-    return posterior
+    assert found is not None  # there is one iteration at least
+    return found
 
 
-def _linear(found: Posterior) -> bool:
+def _linear(found: Solution) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
-    whitened, now = found.whitened, found.whitened.at
-    update = now.update
+    now, update = found.at, found.at.update
     step = (found.change - now.change)[update.measured]
     seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
     errors = update.predicted(found.camera, found.change) - now.z - (now.own @ seen[:, :, None])[:, :, 0]
-    errors = np.where(now.seen & whitened.used[:, None], errors, 0.0)
+    errors = np.where(now.seen & found.used[:, None], errors, 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
-    shift = (whitened.inverse @ errors.reshape(-1)[whitened.rows]) @ whitened.by_pose
-    variances = update.covariance.pose.diagonal() - (whitened.by_pose**2).sum(axis=0)
+    shift = (found.L_inverse @ errors.reshape(-1)[found.rows]) @ found.by_pose
+    variances = update.covariance.pose.diagonal() - (found.by_pose**2).sum(axis=0)
     return bool((shift**2 <= _POSE_SHARE**2 * variances).all())

@@ -9,8 +9,8 @@ from numpy.linalg import LinAlgError
 
 from backends.ekf.camera import Camera, Motion
 from backends.ekf.covariance import CAMERA, HEAD, Covariance
+from backends.ekf.innovation import Solution
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
-from backends.ekf.solve import Posterior
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
 
@@ -148,7 +148,7 @@ class FilterState:
 
     # --- updates ---
 
-    def corrected(self, found: Posterior) -> FilterState:
+    def corrected(self, found: Solution) -> FilterState:
         """After an update.
 
         A displacement of camera and landmarks together is unobservable. What it changes in each coordinate depends on
@@ -160,13 +160,13 @@ class FilterState:
         and Bonnabel, 2015). Parked landmarks do not move, so that their coordinates need none. Raises
         LinAlgError where the new state is not finite, or a variance is lost in rounding.
         """
-        update, camera = found.whitened.at.update, found.camera
+        update, camera = found.at.update, found.camera
         marks = self.landmarks.moved(update.coordinates, self._parts()[1], found.change[CAMERA:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise LinAlgError("the corrected state is not finite")
         marks.seen[update.rows[found.used]] = self.frame
         J, shift = update.camera.transport(camera), self._shift(marks, camera)
-        covariance = update.covariance.corrected(*found.whitened.gain_root(), J, shift)
+        covariance = update.covariance.corrected(*found.gain_root(), J, shift)
         if not (covariance.P.diagonal()[HEAD:] > 0).all():
             raise LinAlgError("a landmark's variance would not stay positive")
         return replace(self, camera=camera, landmarks=marks, covariance=covariance)

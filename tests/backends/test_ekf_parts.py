@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from backends.ekf.backend import EkfConfig
 from backends.ekf.camera import moved
 from backends.ekf.covariance import CAMERA, HEAD, Covariance
-from backends.ekf.innovation import Update, Whitened
+from backends.ekf.innovation import Solution, Update
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth
 from backends.ekf.motion import EulerCamera
 from backends.ekf.solve import gate, solve
@@ -252,7 +252,7 @@ def test_the_update_is_the_joseph_form(coordinates):
     assert np.abs(difference).max() < 1e-5  # what the differences leave in H
     found = np.concatenate([after.camera.x, after.landmarks.c.reshape(-1)])
     np.testing.assert_allclose(found, x + K @ nu, rtol=1e-6, atol=1e-6)
-    assert solution.whitened.w @ solution.whitened.w == pytest.approx(nu @ np.linalg.solve(S, nu), rel=1e-6)
+    assert solution.w @ solution.w == pytest.approx(nu @ np.linalg.solve(S, nu), rel=1e-6)
 
 
 @pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
@@ -306,7 +306,7 @@ def corrected(s: FilterState, update: Update) -> np.ndarray:
 
 
 def residuals(s: FilterState, update: Update, change: np.ndarray) -> np.ndarray:
-    """Whitened: of the prior, whose covariance is diagonal, and of the measurements."""
+    """Solution: of the prior, whose covariance is diagonal, and of the measurements."""
     z = update.linearised(s.camera.moved(change[:12]), change[12:]).z
     prior = change / np.sqrt(np.diag(dense(s.covariance)))
     return np.concatenate([prior, ((update.z - z) / update.sigma).reshape(-1)])
@@ -323,7 +323,7 @@ def test_the_iterated_update_is_the_maximum_of_the_posterior(spread, monkeypatch
     cost = lambda x: residuals(s, update, deviation * x)  # noqa: E731
     best = least_squares(cost, np.zeros(48), xtol=1e-12, ftol=1e-12, gtol=1e-12)
     np.testing.assert_allclose(corrected(s, update), deviation * best.x, atol=1e-5)
-    w = solution.whitened.w
+    w = solution.w
     assert w @ w == pytest.approx(2 * best.cost, rel=1e-3)  # νᵀS⁻¹ν there is the least cost
 
 
@@ -377,17 +377,17 @@ def test_what_is_taken_out_was_never_there():
     """A landmark's distance from what the others predict is the fall of the NIS when it is left out."""
     s, update = far_off(1)
 
-    def whitened(update: Update, used: np.ndarray) -> Whitened:
-        return gate(update).at.whitened(used)
+    def solved(update: Update, used: np.ndarray) -> Solution:
+        return gate(update).at.solved(used)
 
-    every, P = whitened(update, np.ones(12, bool)), dense(s.covariance)
+    every, P = solved(update, np.ones(12, bool)), dense(s.covariance)
     for gone in ([0], [5], [11], [3, 4, 8]):
         mask = np.isin(np.arange(12), gone)
-        without = whitened(update, ~mask)
+        without = solved(update, ~mask)
         if len(gone) == 1:
             fall = every.w @ every.w - without.w @ without.w
             assert fall == pytest.approx(every.distances()[gone[0]], rel=1e-6)
-        fresh = whitened(replace(update, z=np.where(mask[:, None], np.nan, update.z)), np.ones(12, bool))
+        fresh = solved(replace(update, z=np.where(mask[:, None], np.nan, update.z)), np.ones(12, bool))
         np.testing.assert_allclose(without.distances(), fresh.distances(), rtol=1e-6, atol=1e-9)
         V, W = (np.delete(one.gain_root()[0], np.s_[12 : s.covariance.begin], 0) for one in (without, fresh))
         np.testing.assert_allclose(in_deviations(V @ V.T, P), in_deviations(W @ W.T, P), atol=1e-9)
