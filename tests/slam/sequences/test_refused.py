@@ -59,7 +59,7 @@ def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, eur
         ("fps=3&kind=driving&fps=30", ConfigurationError, "option 'fps' is given twice"),
         ("fps=0", ConfigurationError, "fps must be a number from 0.001"),
         ("rectified=yes", CalibrationError, "P1, P2 are missing"),
-        ("speed=3", ConfigurationError, "unknown option 'speed' of format folders; known: calibration, fi"),
+        ("speed=3", ConfigurationError, "format folders: unknown option 'speed'; known: calibration, fi"),
         ("mask=black.png", ConfigurationError, "black all over"),
         ("mask=small.png", ConfigurationError, "another size"),
     ],
