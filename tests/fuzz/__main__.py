@@ -1,4 +1,9 @@
-"""``python -m tests.fuzz``: many cases of every class, with counts, and the failures by kind."""
+"""Hostile input for every part that reads any: many cases of every class, with counts, and the failures by kind.
+
+A class of inputs is a generator of cases. A case is made of a seed and its number alone, so each can be had again. It
+holds where what is promised is kept: a result, or a `SlamError` of one line, within `harness.SECONDS` of processor time
+and a bounded memory, with nothing printed. `test_fuzz.py` is the short form.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +21,7 @@ SUBJECTS = tuple(subject for module in (readers, saved, bookkeeping) for subject
 
 def main() -> int:
     """Exit status 1 where a case failed."""
-    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__.partition("\n")[0])
     parser.add_argument("--cases", type=int, default=200, help="of each class (default %(default)s)")
     parser.add_argument("--only", choices=[s.name for s in SUBJECTS], action="append", help="a class by name")
     parser.add_argument("--seed", type=int, default=0)
