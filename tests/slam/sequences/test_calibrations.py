@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,8 +13,6 @@ import pytest
 import slam
 from slam.errors import CalibrationError, ConfigurationError, SlamError
 from slam.sequences import open_sequence
-from slam.sequences.rigs import read_rig
-from tests.recordings import write_opencv
 
 SIZE = (64, 48)
 K = np.array([[50.0, 0, 31.5], [0, 51.0, 23.5], [0, 0, 1]])
@@ -227,16 +224,6 @@ def test_distortions_of_every_kind_and_length(tmp_path: Path, build: SimpleNames
     build.write_storage(file, {**e, "D1": D})
     with pytest.raises(CalibrationError, match="thin prisms"):
         slam.load_rig(file, size=SIZE)
-
-
-def test_a_written_calibration_is_of_the_images_as_recorded(tmp_path: Path) -> None:
-    camera = slam.StereoRig.from_pinhole([[50.0, 0, 20], [0, 50, 30], [0, 0, 1]], baseline=0.2, size=(48, 64)).left
-    camera = replace(camera, model="radtan", distortion=(0.1, 0.0, 0.01, 0.02))
-    rig = slam.StereoRig.side_by_side(camera, camera, np.eye(3), np.array([0.0, -0.2, 0.0]))
-    write_opencv(tmp_path / "c.yaml", rig)
-    again = read_rig([tmp_path / "c.yaml"], (48, 64), {})
-    assert again.turns == rig.turns == 1
-    assert again.left == rig.left and np.allclose(again.b, rig.b)
 
 
 # ------------------------------------------------------------------------------------------------ refused

@@ -128,5 +128,5 @@ def test_what_is_asked_for_wrongly_is_one_line(rig_here, played, tmp_path):
 
 def test_a_file_is_no_camera(rig_here, tmp_path):
     (tmp_path / "both.avi").write_text("x")
-    with pytest.raises(SequenceError, match="a file, not a camera; .*layout=sbs"):
+    with pytest.raises(SequenceError, match=r"a file, not a camera; .*layout=sbs"):
         slam.open_sequence("camera:both.avi")
