@@ -6,6 +6,7 @@ import slam
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.run.drawing import FramePictures
+from slam.run.schema import body_colour
 from tests.failing_runs import disk_of
 
 
@@ -14,6 +15,10 @@ def steps():
     sequence = slam.open_sequence("synthetic:desk?frames=2")
     system = slam.StereoSlam(sequence.rig, config=SystemConfig.for_kind("handheld"))
     return system, [(frame, system.process(frame)) for frame in sequence]
+
+
+def test_fifteen_bodies_have_colours_of_their_own():
+    assert len({body_colour(body) for body in range(1, 16)}) == 15
 
 
 def test_places_that_cannot_be_written_are_said(steps, tmp_path):
