@@ -174,6 +174,9 @@ def test_the_same_rig_in_the_words_of_many_programs_and_people(tmp_path: Path, n
     assert rig.left.fu == options.get("focal", 50) and rig.is_rectified == (distortion is None)
     assert rig.baseline == pytest.approx(0.2, rel=1e-5)
     assert distortion is None or rig.left.distortion[0] == distortion
+    if rig.is_rectified:
+        with pytest.raises(ConfigurationError, match="'fisheye' does nothing with"):
+            load(tmp_path, name, fisheye=True)
     if name in UNITS_OF_THEIR_OWN:
         with pytest.raises(ConfigurationError, match="'unit' does nothing with"):
             load(tmp_path, name, unit="cm")
