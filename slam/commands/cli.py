@@ -153,7 +153,7 @@ def run_command(
         folder = stack.enter_context(run_folder(out, opened.name, options.backend))
         options = replace(options, out=folder)
         written = [*options.outputs, *([drawing.output(draw)] if draw else []), *viewing.outputs(viewer, "--viewer")]
-        require_outputs(written, [*inputs, *options.inputs], overwrite)
+        require_outputs(written, inputs, overwrite)
         gathered = RunRecord()  # its time of compiling begins here
         tell = stack.enter_context(progress(*shown_as))
         if options.config.objects.mode != "off":

@@ -150,10 +150,9 @@ def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
             models = inside.models(config.models)
             registry.create("backends", trial.backend, inside.rig, models=models, **config.backend)
     held = read_object(out / SWEEP).get("trials") if (out / SWEEP).is_file() and not overwrite else None
-    goes_on = isinstance(held, list)
-    if goes_on and not set(map(json.dumps, held)) <= {json.dumps(asdict(trial)) for trial in plan.every}:
+    if isinstance(held, list) and not set(map(json.dumps, held)) <= {json.dumps(asdict(trial)) for trial in plan.every}:
         raise SlamError(f"{out}: holds a comparison of more or other runs; give another --out, or --overwrite")
-    require_outputs([Output(out, "--out", NAMES)], inputs, overwrite or goes_on)
+    require_outputs([Output(out, "--out", NAMES)], inputs, overwrite or isinstance(held, list))
     return frames
 
 
