@@ -12,7 +12,6 @@ of θ and of the baseline's length, and 1, whose column has the field ``−F_k c
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +38,7 @@ from slam.calibration.posterior import (
 from slam.calibration.saved import SavedCalibration, joint_calibration
 from slam.data import CommonError, Estimate, StereoFeatures
 from slam.errors import ConfigurationError
+from slam.geometry.arrays import changed
 from slam.geometry.rig import StereoRig
 from slam.geometry.rig_numbers import rig_numbers
 from slam.geometry.se3 import Array, adjoint
@@ -296,11 +296,25 @@ class RemainingRigError:
         self._revised = np.zeros(len(calibration.model.names))  # changes of the correction that the whole path followed
         self._turned = np.zeros(6)  # how the world turned as the whole path was revised: a motion, on the left
         self._root: tuple[Array, Array] | None = None  # of the last covariance, which is asked for thrice in a frame
+        # the last back end, and whether it can consider errors of the rig, and revise: slow to find out
+        self._asked: tuple[Backend | None, bool, bool] = None, False, False
 
     def follow(self, backend: Backend, pose: Array | None = None) -> None:
         """Let a back end that can follow the errors, before its first frame; `pose` (6, m) is J of its first pose."""
-        if self._calibration.config.enabled and isinstance(backend, ConsideringBackend):
-            backend.consider(self.field, pose)
+        considering = self._considering(backend)
+        if considering is not None:
+            considering.consider(self.field, pose)
+
+    def _can(self, backend: Backend) -> tuple[bool, bool]:
+        """Whether a back end can consider errors of the rig, and revise."""
+        if backend is not self._asked[0]:
+            self._asked = backend, isinstance(backend, ConsideringBackend), isinstance(backend, RevisingBackend)
+        return self._asked[1:]
+
+    def _considering(self, backend: Backend) -> ConsideringBackend | None:
+        """The back end, if it considers the rig's error."""
+        considers = self._calibration.config.enabled and self._can(backend)[0]
+        return backend if considers else None  # type: ignore[return-value]
 
     def field(self, z: Array) -> Array:
         """Derivatives (N, 3, n + 2) of true rows (uL, vL, uR) by what is followed, at corrected rows (N, 3) [px]."""
@@ -319,7 +333,7 @@ class RemainingRigError:
         For a back end that can revise, a change means processing all its measurements again, so it waits until the
         change is significant.
         """
-        return self._calibration.apply(_SIGNIFICANT if isinstance(backend, RevisingBackend) else 0.0)
+        return self._calibration.apply(_SIGNIFICANT if self._can(backend)[1] else 0.0)
 
     def revise(self, backend: Backend, restarted: bool) -> Revision | None:
         """Correct a back end's earlier measurements, if it can revise them; returns the change, or None.
@@ -327,8 +341,9 @@ class RemainingRigError:
         Where the back end has `restarted`, part of the path is an earlier one's and cannot be revised.
         """
         applied = self._calibration.applied
-        if not isinstance(backend, RevisingBackend) or applied is self._measured_with:
+        if not self._can(backend)[1] or applied is self._measured_with:
             return None
+        assert isinstance(backend, RevisingBackend)
         revision = Revision(self._measured_with, applied)
         whole = not restarted and backend.revises_path
         if whole:
@@ -342,11 +357,12 @@ class RemainingRigError:
 
     def added_to(self, backend: Backend, estimate: Estimate) -> Estimate:
         """The back end's estimate with the rig's uncertainty added."""
-        if not (self._calibration.config.enabled and isinstance(backend, ConsideringBackend)):
+        considering = self._considering(backend)
+        if considering is None:
             return estimate
-        root, (J, L) = self._common_root(self._revised), backend.sensitivities(estimate.ids)
+        root, (J, L) = self._common_root(self._revised), considering.sensitivities(estimate.ids)
         J, L = J @ root, L @ root
-        return replace(
+        return changed(
             estimate, covariance=estimate.covariance + J @ J.T,
             covariances=estimate.covariances + L @ np.swapaxes(L, 1, 2),
         )  # fmt: skip
@@ -362,9 +378,10 @@ class RemainingRigError:
         as reported in each frame, with the correction of that time; else for the present path, in which a back end may
         have revised earlier poses.
         """
-        if not (self._calibration.config.enabled and isinstance(backend, ConsideringBackend)):
+        considering = self._considering(backend)
+        if considering is None:
             return CommonError()
-        J, revised = _of_pose(backend), self._revised
+        J, revised = _of_pose(considering), self._revised
         if as_reported:
             J, revised = J.copy(), 0.0 * revised
             J[:, -1] -= J[:, :-2] @ self._revised

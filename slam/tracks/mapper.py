@@ -6,7 +6,6 @@ move, duplicate another one, crowd a place out of view, or if the map is full.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ from slam.checks import in_front
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IdArray, IndexArray, StereoFeatures
 from slam.errors import ConfigurationError
-from slam.geometry.arrays import Array, isin
+from slam.geometry.arrays import Array, changed, isin
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import inverse, transform
 from slam.interfaces import Backend, MapBackend
@@ -89,7 +88,7 @@ class Mapper:
             tracks.erase_landmarks(surplus)
         if len(erased):  # once a frame: it costs a filter a copy of its covariance
             backend.remove(erased)
-        return replace(step, erased=erased)
+        return changed(step, erased=erased)
 
     def insert(
         self, backend: Backend, tracks: Tracks, landmarks: LandmarkTable, positions: Array, covariances: Array
@@ -104,7 +103,7 @@ class Mapper:
         ids = landmarks.ids[new]
         ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
         backend.insert(ids, positions[new], covariances[new])
-        return tracks.with_landmarks(replace(landmarks.select(new), ids=ids))
+        return tracks.with_landmarks(changed(landmarks.select(new), ids=ids))
 
     def reconcile(self, backend: Backend, tracks: Tracks | None) -> Tracks | None:
         """Make table and back end agree after an interrupted step: landmarks that only one of them has are erased.
@@ -178,7 +177,7 @@ class Mapper:
         """A step whose features `rows` (M,) have become landmarks, with ids that were never used."""
         ids = self._new_ids(len(rows))
         step.tracks.enter_landmarks(step.index, ids, step.features, rows, step.estimate.T_world_left[:3, 3])
-        return replace(step, added=step.added.joined(LandmarkMatches(ids, rows)))
+        return changed(step, added=step.added.joined(LandmarkMatches(ids, rows)))
 
     def _new_ids(self, count: int) -> IdArray:
         ids = np.arange(self.next_id, self.next_id + count, dtype=np.int64)
