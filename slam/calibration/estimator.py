@@ -28,6 +28,7 @@ from slam.calibration.posterior import (
     RigPosterior,
     along,
     factory_prior,
+    mean_variance,
     prior_information,
     residual_likelihoods,
     resumed_prior,
@@ -88,7 +89,7 @@ class SelfCalibration:
         self._fields: Evidence | None = None  # of rows: parameters and residual fields
         self._far = self.model.field(self.model.far())[:, 2]  # disparities of far points by the parameters
         self._focal = along(self.model, *FOCALS) / 2  # the focal lengths' common error by the parameters
-        self._unknown = _mean_variance(self._far, np.linalg.inv(prior_information(self.model)))
+        self._unknown = mean_variance(self._far, np.linalg.inv(prior_information(self.model)))
         self._variances = np.log(np.square([config.pixel_sigma, config.disparity_sigma]))  # and of how many pairs
         self._scattered = 4  # 4: number of pairs that the configured noise counts for
         self._waiting: list[View] = []
@@ -133,7 +134,7 @@ class SelfCalibration:
         """
         if not self.config.enabled:
             return None
-        variance = _mean_variance(self._far, self._own.covariance)
+        variance = mean_variance(self._far, self._own.covariance)
         known = self._kept is not None or (variance <= 0.5 * self._unknown and self._motion_agrees())
         mean = self._own.mean if known else np.zeros_like(self._own.mean)
         step = mean - self.applied.parameters
@@ -280,11 +281,6 @@ class SelfCalibration:
         self._by_bias = gain * self._systematic @ gain.T + found.fields * effect @ effect.T
 
 
-def _mean_variance(changes: Array, covariance: Array) -> float:
-    """Mean variance of changes (N, n) by the parameters, with their covariance (n, n)."""
-    return float((changes @ covariance * changes).sum(axis=1).mean())
-
-
 class RemainingRigError:
     """The rig's error that is left in a back end's estimate while self-calibration continues.
 
@@ -296,25 +292,19 @@ class RemainingRigError:
         self._revised = np.zeros(len(calibration.model.names))  # changes of the correction that the whole path followed
         self._turned = np.zeros(6)  # how the world turned as the whole path was revised: a motion, on the left
         self._root: tuple[Array, Array] | None = None  # of the last covariance, which is asked for thrice in a frame
-        # the last back end, and whether it can consider errors of the rig, and revise: slow to find out
-        self._asked: tuple[Backend | None, bool, bool] = None, False, False
+        self._asked: tuple[Backend | None, bool] = None, False  # a back end, and whether it considers the rig's error
 
     def follow(self, backend: Backend, pose: Array | None = None) -> None:
         """Let a back end that can follow the errors, before its first frame; `pose` (6, m) is J of its first pose."""
-        considering = self._considering(backend)
-        if considering is not None:
+        if (considering := self._considering(backend)) is not None:
             considering.consider(self.field, pose)
 
-    def _can(self, backend: Backend) -> tuple[bool, bool]:
-        """Whether a back end can consider errors of the rig, and revise."""
-        if backend is not self._asked[0]:
-            self._asked = backend, isinstance(backend, ConsideringBackend), isinstance(backend, RevisingBackend)
-        return self._asked[1:]
-
     def _considering(self, backend: Backend) -> ConsideringBackend | None:
-        """The back end, if it considers the rig's error."""
-        considers = self._calibration.config.enabled and self._can(backend)[0]
-        return backend if considers else None  # type: ignore[return-value]
+        """The back end, if it considers the rig's error; that takes long to find out."""
+        if backend is not self._asked[0]:
+            considers = self._calibration.config.enabled and isinstance(backend, ConsideringBackend)
+            self._asked = backend, considers
+        return backend if self._asked[1] else None  # type: ignore[return-value]
 
     def field(self, z: Array) -> Array:
         """Derivatives (N, 3, n + 2) of true rows (uL, vL, uR) by what is followed, at corrected rows (N, 3) [px]."""
@@ -333,7 +323,7 @@ class RemainingRigError:
         For a back end that can revise, a change means processing all its measurements again, so it waits until the
         change is significant.
         """
-        return self._calibration.apply(_SIGNIFICANT if self._can(backend)[1] else 0.0)
+        return self._calibration.apply(_SIGNIFICANT if isinstance(backend, RevisingBackend) else 0.0)
 
     def revise(self, backend: Backend, restarted: bool) -> Revision | None:
         """Correct a back end's earlier measurements, if it can revise them; returns the change, or None.
@@ -341,9 +331,8 @@ class RemainingRigError:
         Where the back end has `restarted`, part of the path is an earlier one's and cannot be revised.
         """
         applied = self._calibration.applied
-        if not self._can(backend)[1] or applied is self._measured_with:
+        if applied is self._measured_with or not isinstance(backend, RevisingBackend):
             return None
-        assert isinstance(backend, RevisingBackend)
         revision = Revision(self._measured_with, applied)
         whole = not restarted and backend.revises_path
         if whole:
@@ -357,8 +346,7 @@ class RemainingRigError:
 
     def added_to(self, backend: Backend, estimate: Estimate) -> Estimate:
         """The back end's estimate with the rig's uncertainty added."""
-        considering = self._considering(backend)
-        if considering is None:
+        if (considering := self._considering(backend)) is None:
             return estimate
         root, (J, L) = self._common_root(self._revised), considering.sensitivities(estimate.ids)
         J, L = J @ root, L @ root
@@ -378,8 +366,7 @@ class RemainingRigError:
         as reported in each frame, with the correction of that time; else for the present path, in which a back end may
         have revised earlier poses.
         """
-        considering = self._considering(backend)
-        if considering is None:
+        if (considering := self._considering(backend)) is None:
             return CommonError()
         J, revised = _of_pose(considering), self._revised
         if as_reported:

@@ -31,7 +31,6 @@ from slam.tracks.follow import first_column
 from slam.tracks.table import LandmarkTable
 
 _SAME_PIXELS = 6.0  # landmarks further apart in the image than this [px] are not the same
-_NEARER = 0.9  # a surface nearer than this share of a landmark's depth may hide it
 
 
 class MapView(NamedTuple):
@@ -73,7 +72,7 @@ def take_census(
     limits = c.view_margin, c.occlusion_radius, c.same_distance, c.same_descriptor
     replaceable = bool(f.has_stereo.any() or not len(f))
     kept = c.erase_missed, c.erase_share, c.confirmed, c.forget_after, float(c.spacing)
-    return _census(  # type: ignore[no-any-return]
+    return _census(
         rows, counts, t.seen_from, t.descriptors, t.laplacian, tuple(view), expected, measured, withheld, frame, seen,
         size, limits, replaceable, kept,
     )  # fmt: skip
@@ -166,7 +165,8 @@ def _hidden(uv, depth, radius, feature_uv, order, points, sigma):
         place += 1
         if abs(feature_uv[f, 1] - uv[1]) <= radius and np.isfinite(sigma[f]):
             near += 1
-            nearer += points[f, 2] + SIGMAS * sigma[f] < _NEARER * depth
+            # 0.9: a surface nearer than this share of a landmark's depth may hide it
+            nearer += points[f, 2] + SIGMAS * sigma[f] < 0.9 * depth
     return radius > 0 and 2 * nearer > near
 
 
