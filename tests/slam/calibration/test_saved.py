@@ -120,6 +120,7 @@ def spoilt(tree, change):
         (lambda t: t["covariance"][0].__setitem__(1, float("nan")), "finite"),
         (lambda t: t["parameters"][3].update(mean=-1e300), "larger than the rig"),
         (lambda t: t["covariance"][0].__setitem__(0, 1e300), "larger than the rig"),
+        *((lambda t, e=e: t.update(evidence=e), "cannot be read") for e in ("x", "", "AAAA", 3, [1.0])),
     ],
 )
 def test_bad_files_get_one_line(first, tmp_path, change, message):
@@ -202,13 +203,6 @@ def test_a_calibration_passed_from_run_to_run_is_no_surer_than_all_recordings_to
     np.testing.assert_allclose(passed.posterior.covariance, together.covariance, rtol=1e-6, atol=1e-15)
 
 
-@pytest.mark.parametrize("evidence", ["x", "", "AAAA", 3, [1.0]])
-def test_evidence_that_is_none_is_refused(first, evidence):
-    tree = first.kept().to_json() | {"evidence": evidence}
-    with pytest.raises(CalibrationError, match="cannot be read"):
-        SavedCalibration.from_json(tree)
-
-
 def test_recordings_of_another_rig_do_not_agree(first):
     other = drive(TURNED + parameters(roll=3e-3), seed=2, frames=20)
     found = agreement(first.model, [first.evidence(), other.evidence()])
@@ -225,9 +219,3 @@ def test_the_prior_that_recordings_share_is_no_agreement(first):
     assert np.isnan(found).all() and agreement_in_words(found).startswith("Nothing can be said")
     half = agreement(first.model, [first.evidence(), silent[1]])
     assert np.isnan(half).all()
-
-
-def test_without_motion_there_is_nothing_to_join(first):
-    assert drive(step=0.0, frames=3).evidence() is None
-    with pytest.raises(CalibrationError, match="no recording"):
-        joint_calibration(first.model, factory_prior(first.model), [])
