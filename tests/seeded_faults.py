@@ -138,12 +138,12 @@ FAULTS = (
         "tests/slam/tracks",
     ),
     Fault(
-        "withheld landmarks count as missed", "slam/tracks/census.py",
+        "withheld landmarks count as missed", "slam/tracks/kernels.py",
         "expected[n] and in_image[n] and not withheld[n]", "expected[n] and in_image[n]",
         "tests/slam/tracks/test_map.py tests/slam/tracks",
     ),
     Fault(
-        "a hidden landmark counts as missed", "slam/tracks/census.py",
+        "a hidden landmark counts as missed", "slam/tracks/kernels.py",
         "nearer += points[f, 2] + SIGMAS * sigma[f] < 0.9 * depth", "nearer += 0",
         "tests/slam/tracks/test_map.py tests/slam/tracks",
     ),

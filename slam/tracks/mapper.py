@@ -1,10 +1,12 @@
 """Birth and death of landmarks after a frame (paper A, IV), in the table of tracks and in the back end alike.
 
 New landmarks are evenly spread and have a well-known depth. Landmarks are erased if they move, have no place in the map
-(see `slam.tracks.census`), or if the map is full.
+(see `take_census`), or if the map is full.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,15 +15,36 @@ from slam.data import BoolArray, IdArray, IndexArray, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.arrays import Array, among, changed, isin
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig
+from slam.geometry.se3 import inverse, transform
 from slam.interfaces import Backend, MapBackend
 from slam.third_party import checked
-from slam.tracks.census import MapView, take_census, view_from
 from slam.tracks.config import MapConfig
-from slam.tracks.follow import apart, pairs_near
+from slam.tracks.kernels import births, census
 from slam.tracks.localizer import Localizer
 from slam.tracks.monocular import depths_by_motion, frame_covariance, unclaimed
 from slam.tracks.step import LandmarkMatches, Step
 from slam.tracks.table import LandmarkTable, Tracks
+
+
+class MapView(NamedTuple):
+    """The map and the frame's features as seen from one pose."""
+
+    positions: Array  # of the landmarks (N, 3) in world coordinates [m]
+    local: Array  # the same in left-camera coordinates (N, 3)
+    uv_left: Array  # the landmarks' left pixels (N, 2), NaN behind the camera
+    in_image: BoolArray  # which landmarks are in front of the camera and inside the left image (N,)
+    points: Array  # the features in left-camera coordinates (F, 3), NaN without depth
+    depth_sigma: Array  # standard deviations of the features' depths (F,) [m]
+
+    @classmethod
+    def of(
+        cls, rig: StereoRig, T_world_left: Array, positions: Array, features: StereoFeatures, pixel_sigma: float
+    ) -> MapView:
+        """Landmarks at `positions` (N, 3) and features, seen from a pose (4, 4)."""
+        local = transform(inverse(T_world_left), positions)
+        uv = rig.left.project(local)
+        points = rig.triangulate(features.uv_left, features.uv_right)
+        return cls(positions, local, uv, rig.left.in_image(uv), points, rig.depth_deviation(points, pixel_sigma))
 
 
 class Mapper:
@@ -91,7 +114,7 @@ class Mapper:
         ids = step.tracks.ids[step.tracks.mapped]
         positions = checked(backend, "positions", backend.positions(ids), n=len(ids))
         T, sigma = step.estimate.T_world_left, self._localizer.models.pixel_sigma
-        return view_from(self.rig, T, positions, step.features, sigma)
+        return MapView.of(self.rig, T, positions, step.features, sigma)
 
     def _census(self, view: MapView, step: Step) -> tuple[BoolArray, BoolArray]:
         """`take_census`; none is expected in the frame if its pose was not measured."""
@@ -161,29 +184,12 @@ def new_landmarks(
     `free` (N,) says which features have a known depth and belong to no landmark; `occupied` (M, 2) are pixels of the
     landmarks in view, the measured ones first.
     """
-    wanted, uv, separation = config.target_in_view - len(occupied), features.uv_left, config.separation
-    rows = np.flatnonzero(free)
+    wanted, rows, left = config.target_in_view - len(occupied), np.flatnonzero(free), rig.left
     if wanted <= 0 or not len(rows):
         return rows[:0]
-    at, which = pairs_near(uv[rows], separation, occupied)
-    gap = uv[rows[at]] - occupied[which]
-    rows = np.delete(rows, at[np.einsum("ij,ij->i", gap, gap) < separation**2])
     rows = rows[np.argsort(-features.response[rows], kind="stable")]
-    columns, lines = config.grid
-    size = np.array([rig.left.width / columns, rig.left.height / lines])
-
-    def cell(pixels: Array) -> IndexArray:
-        c = np.clip((pixels / size).astype(int), 0, (columns - 1, lines - 1))
-        return c[:, 1] * columns + c[:, 0]
-
-    # Queue by each feature's rank in its cell plus the cell's landmarks: features of empty cells come first.
-    load, cells = np.bincount(cell(occupied), minlength=columns * lines), cell(uv[rows])
-    order = np.argsort(cells, kind="stable")
-    starts = np.searchsorted(cells[order], np.arange(columns * lines))
-    rank = np.empty(len(rows), int)
-    rank[order] = np.arange(len(rows)) - starts[cells[order]]
-    queue = rows[np.argsort(rank + load[cells], kind="stable")]
-    return apart(np.ascontiguousarray(uv), queue, wanted, float(separation))
+    uv, size = np.ascontiguousarray(features.uv_left), (left.width, left.height)
+    return births(uv, rows, np.ascontiguousarray(occupied), wanted, float(config.separation), config.grid, size)
 
 
 def depth_is_known(
@@ -207,3 +213,35 @@ def surplus_landmarks(landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
         order = np.lexsort((landmarks.last_seen, landmarks.seen > 1, now))
         out[order[:surplus]] = True
     return out
+
+
+def take_census(
+    table: LandmarkTable, rows: IndexArray, view: MapView, expected: BoolArray, measured: BoolArray,
+    withheld: BoolArray, frame: int, features: StereoFeatures, rig: StereoRig, config: MapConfig,
+) -> tuple[BoolArray, BoolArray]:  # fmt: skip
+    """Count a frame for the landmarks at `rows` (N,), in place; which of them go, and which features (F,) are of one.
+
+    Of those `expected` (N,), the ones that are near the border or hidden, among features most of which are clearly
+    nearer, are not missed; nor are those `withheld` (N,) from the update, for which the frame counts as neither missed
+    nor seen. `measured` (N,) says which were measured. A landmark goes if it
+
+    - duplicates another one in view that was seen more often, or as often and is older. A feature's depth may differ
+      from a landmark's by stereo's uncertainty, else their points have to be the same;
+    - is not continuously detected although in view (paper A, IV): missed too often in a row, seen in too small a share
+      of the frames, or never confirmed; or was not seen for longer than a map remembers. Where no feature could take
+      its place it stays, and one of a loaded map until this run has seen it;
+    - has just gone out of view, close to another one out of view that was seen more often, or is that other one, see
+      `MapConfig.spacing`. Those of a loaded map that this run has not seen yet are only such others.
+    """
+    t, c, f = table, config, features
+    order = np.argsort(f.uv_left[:, 0], kind="stable")
+    counts = t.seen, t.in_view, t.missed, t.last_seen, t.out_of_view, t.unseen
+    seen = np.ascontiguousarray(f.uv_left), f.descriptors, f.laplacian, order
+    size = float(rig.left.width), float(rig.left.height)
+    limits = c.view_margin, c.occlusion_radius, c.same_distance, c.same_descriptor
+    replaceable = bool(f.has_stereo.any() or not len(f))
+    kept = c.erase_missed, c.erase_share, c.confirmed, c.forget_after, float(c.spacing)
+    return census(
+        rows, counts, t.seen_from, t.descriptors, t.laplacian, tuple(view), expected, measured, withheld, frame, seen,
+        size, limits, replaceable, kept,
+    )  # fmt: skip

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from slam.data import StereoFeatures
-from slam.tracks.census import take_census, view_from
 from slam.tracks.config import MapConfig
-from slam.tracks.mapper import depth_is_known, new_landmarks, surplus_landmarks
+from slam.tracks.mapper import MapView, depth_is_known, new_landmarks, surplus_landmarks, take_census
 from slam.tracks.table import LandmarkTable
 from tests.slam.scene import RIG
 
@@ -62,7 +61,7 @@ def census(rows, config, positions=None, features=None, frame=9, expected=True, 
     n = len(rows.ids)
     positions = np.zeros((n, 3)) if positions is None else positions  # none is in the image
     features = features_at(np.zeros((0, 2))) if features is None else features
-    view = view_from(RIG, np.eye(4), positions, features, 1.0)
+    view = MapView.of(RIG, np.eye(4), positions, features, 1.0)
     marks = (np.full(n, expected), np.isin(rows.ids, measured), np.isin(rows.ids, withheld))
     return [x.tolist() for x in take_census(rows, np.arange(n), view, *marks, frame, features, RIG, config)]
 

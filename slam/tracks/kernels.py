@@ -1,89 +1,69 @@
-"""The pass over all landmarks after a frame: which were seen or missed, and which have no place in the map any longer.
-
-A landmark should have been detected if it lies inside the image by a margin, in a view similar to that of its first
-sight, and is not hidden: most of the features around it are not clearly nearer than it is.
-
-A landmark has no place in the map if it
-
-- duplicates another one in view that was seen more often, or as often and is older. A feature's depth may differ from a
-  landmark's by stereo's uncertainty, else their points have to be the same;
-- is not continuously detected although in view (paper A, IV): missed too often in a row, seen in too small a share of
-  the frames, or never confirmed; or was not seen for longer than a map remembers. Where no feature could take its
-  place, it stays. Those of a loaded map stay until this run has seen them;
-- has just gone out of view, and another landmark out of view was seen more often, see `MapConfig.spacing`; or is that
-  other one. Those of a loaded map that this run has not seen yet are only such others.
-"""
+"""Compiled passes of `slam.tracks.mapper`: over all landmarks after a frame, and over features that may become some."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
 from slam.chi_square import SIGMAS
-from slam.data import BoolArray, IndexArray, StereoFeatures
-from slam.geometry.arrays import Array
-from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import inverse, transform
 from slam.runtime.compilation import helper, kernel
-from slam.tracks.config import MapConfig
 from slam.tracks.follow import first_column
-from slam.tracks.table import LandmarkTable
 
 _SAME_PIXELS = 6.0  # landmarks further apart in the image than this [px] are not the same
 
 
-class MapView(NamedTuple):
-    """The map and the frame's features as seen from one pose."""
+@kernel
+def births(uv, rows, occupied, wanted, separation, grid, size):
+    """The first `wanted` of the `rows` (K,), by falling response, of features at pixels `uv` (N, 2): `new_landmarks`.
 
-    positions: Array  # of the landmarks (N, 3) in world coordinates [m]
-    local: Array  # the same in left-camera coordinates (N, 3)
-    uv_left: Array  # the landmarks' left pixels (N, 2), NaN behind the camera
-    in_image: BoolArray  # which landmarks are in front of the camera and inside the left image (N,)
-    points: Array  # the features in left-camera coordinates (F, 3), NaN without depth
-    depth_sigma: Array  # standard deviations of the features' depths (F,) [m]
-
-
-def view_from(
-    rig: StereoRig, T_world_left: Array, positions: Array, features: StereoFeatures, pixel_sigma: float
-) -> MapView:
-    """Landmarks at `positions` (N, 3) and features, seen from a pose (4, 4)."""
-    local = transform(inverse(T_world_left), positions)
-    uv = rig.left.project(local)
-    points = rig.triangulate(features.uv_left, features.uv_right)
-    return MapView(positions, local, uv, rig.left.in_image(uv), points, rig.depth_deviation(points, pixel_sigma))
-
-
-def take_census(
-    table: LandmarkTable, rows: IndexArray, view: MapView, expected: BoolArray, measured: BoolArray,
-    withheld: BoolArray, frame: int, features: StereoFeatures, rig: StereoRig, config: MapConfig,
-) -> tuple[BoolArray, BoolArray]:  # fmt: skip
-    """Count a frame for the landmarks at `rows` (N,), in place; which of them go, and which features (F,) are of one.
-
-    `expected` (N,) says which can be expected in the frame, unless they are hidden or near the border; `measured` (N,)
-    which were measured, and `withheld` (N,) which were kept from the update: for these the frame counts as neither
-    missed nor seen.
+    Features of cells with few landmarks, at pixels `occupied` (M, 2), and few features before them come first.
     """
-    t, c, f = table, config, features
-    order = np.argsort(f.uv_left[:, 0], kind="stable")
-    counts = t.seen, t.in_view, t.missed, t.last_seen, t.out_of_view, t.unseen
-    seen = np.ascontiguousarray(f.uv_left), f.descriptors, f.laplacian, order
-    size = float(rig.left.width), float(rig.left.height)
-    limits = c.view_margin, c.occlusion_radius, c.same_distance, c.same_descriptor
-    replaceable = bool(f.has_stereo.any() or not len(f))
-    kept = c.erase_missed, c.erase_share, c.confirmed, c.forget_after, float(c.spacing)
-    return _census(
-        rows, counts, t.seen_from, t.descriptors, t.laplacian, tuple(view), expected, measured, withheld, frame, seen,
-        size, limits, replaceable, kept,
-    )  # fmt: skip
+    load, last = np.zeros(grid[0] * grid[1], np.int64), -1
+    for k in range(len(occupied)):
+        load[_cell(occupied[k], grid, size)] += 1
+    turn = np.full(len(rows), -1)
+    for k in range(len(rows)):
+        if _clear(uv[rows[k]], occupied, len(occupied), separation):
+            cell = _cell(uv[rows[k]], grid, size)
+            turn[k] = load[cell]
+            load[cell] += 1
+            last = max(last, turn[k])
+    wanted = min(wanted, len(rows))
+    chosen, places, count = np.empty(wanted, np.intp), np.empty((wanted, 2)), 0
+    for now in range(last + 1):
+        for k in range(len(rows)):
+            if turn[k] == now and count < wanted and _clear(uv[rows[k]], places, count, separation):
+                chosen[count] = rows[k]
+                places[count, 0], places[count, 1] = uv[rows[k], 0], uv[rows[k], 1]
+                count += 1
+    return chosen[:count]
+
+
+@helper
+def _cell(pixel, grid, size):
+    """Number of the cell of a grid of columns and rows in which a pixel lies; `size` is that of the image."""
+    column, row = int(pixel[0] / (size[0] / grid[0])), int(pixel[1] / (size[1] / grid[1]))
+    return min(max(row, 0), grid[1] - 1) * grid[0] + min(max(column, 0), grid[0] - 1)
+
+
+@helper
+def _clear(pixel, others, count, separation):
+    """Whether a pixel is not closer than the separation [px] to the first `count` of the others."""
+    for k in range(count):
+        dx, dy = pixel[0] - others[k, 0], pixel[1] - others[k, 1]
+        if dx * dx + dy * dy < separation * separation:
+            return False
+    return True
 
 
 @kernel
-def _census(
+def census(
     rows, counts, seen_from, looks, signs, view, expected, measured, withheld, frame, features, size, limits,
     replaceable, kept,
 ):  # fmt: skip
-    """`take_census`, of columns of the table and of the features; `limits` and `kept` are settings."""
+    """Which landmarks (N,) go, and which features (F,) are one of them; the columns of the table count the frame.
+
+    See `take_census` of the mapper. `rows` (N,) are the landmarks' in the columns; `limits` and `kept` are settings.
+    """
     positions, local, uv, in_image, points, sigma = view
     feature_uv, feature_looks, feature_signs, order = features
     margin, radius, same_distance, same_look = limits
