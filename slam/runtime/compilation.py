@@ -249,16 +249,11 @@ class Stages:
 
     def __init__(self) -> None:
         self.milliseconds: dict[str, float] = {}
-        self._name, self._start = "", 0.0  # of the stage entered last
-
-    @property
-    def begun(self) -> bool:
-        """Whether a stage has been entered."""
-        return bool(self._name)
+        self.begun, self._since = "", 0.0  # the stage entered last, empty before the first, and when
 
     def stage(self, name: str) -> Stages:
         """``with`` this around a stage; where no exception ends it, its time adds to that of the same stage before."""
-        self._name, self._start = name, working_time()
+        self.begun, self._since = name, working_time()
         return self
 
     def __enter__(self) -> None:
@@ -266,5 +261,5 @@ class Stages:
 
     def __exit__(self, kind: object, *error: object) -> None:
         if kind is None:
-            spent = self.milliseconds.get(self._name, 0.0)
-            self.milliseconds[self._name] = spent + 1e3 * (working_time() - self._start)
+            before = self.milliseconds.get(self.begun, 0.0)
+            self.milliseconds[self.begun] = before + 1e3 * (working_time() - self._since)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import slam
-from slam.calibration import RigModel, SavedCalibration, SelfCalibration, SelfCalibrationConfig
+from slam.calibration import RigModel, SelfCalibration, SelfCalibrationConfig
 from slam.calibration.posterior import RESIDUAL_SCALES, Evidence, RigEvidence, factory_prior, systematic_variance
 from slam.calibration.saved import agreement, agreement_in_words, joint_calibration
 from slam.errors import CalibrationError, ConfigurationError
@@ -24,11 +24,6 @@ from tests.slam.calibration.drives import (
 )
 
 TURNED = parameters(pitch=5e-4, yaw=5e-4, roll=5e-4)
-
-
-def scaled(evidence, factor):
-    """The evidence of a recording with `factor` times the information."""
-    return evidence._replace(plain=evidence.plain.scaled(factor), apart=evidence.apart.scaled(factor))
 
 
 @pytest.fixture(scope="module")
@@ -189,20 +184,6 @@ def test_errors_that_no_parameter_holds_do_not_drive_recordings_apart():
     assert together < 0.8 * min(alone) and max(alone) < 0.004
 
 
-def test_a_calibration_passed_from_run_to_run_is_no_surer_than_all_recordings_together():
-    """They share the fields that no parameter holds: taken for independent, the NEES was 3.5 after eight runs."""
-    model, rng = RigModel(CAR), np.random.default_rng(1)
-    prior, fields = factory_prior(model), -RESIDUAL_SCALES[6] * residual_fields(rng)
-    theta = np.linalg.cholesky(prior.covariances[-1]) @ rng.standard_normal(len(prior.mean))
-    recordings, passed = [shown(model, (0, 0.05), theta, fields, rng) for _ in range(8)], None
-    for recording in recordings:
-        kept = joint_calibration(model, prior, [*([passed.evidence] if passed else []), recording])
-        passed = SavedCalibration.from_json(json.loads(json.dumps(kept.to_json())))
-    together = joint_calibration(model, prior, recordings).posterior
-    np.testing.assert_allclose(passed.posterior.mean, together.mean, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(passed.posterior.covariance, together.covariance, rtol=1e-6, atol=1e-15)
-
-
 def test_recordings_of_another_rig_do_not_agree(first):
     other = drive(TURNED + parameters(roll=3e-3), seed=2, frames=20)
     found = agreement(first.model, [first.evidence(), other.evidence()])
@@ -210,12 +191,3 @@ def test_recordings_of_another_rig_do_not_agree(first):
         found
     )
     assert found[18] > 3
-
-
-def test_the_prior_that_recordings_share_is_no_agreement(first):
-    """Two that say next to nothing are both near the calibration as delivered."""
-    silent = [scaled(d.evidence(), 1e-9) for d in (first, drive(TURNED + parameters(roll=3e-3), seed=2, frames=20))]
-    found = agreement(first.model, silent)
-    assert np.isnan(found).all() and agreement_in_words(found).startswith("Nothing can be said")
-    half = agreement(first.model, [first.evidence(), silent[1]])
-    assert np.isnan(half).all()
