@@ -250,10 +250,11 @@ class MovingObjectDetector(ObjectDetector):
             if not body.measured or (whole is not None and whole.id not in scenes):
                 continue
             members = np.flatnonzero((tracks.body == body.id) & tracks.found)
+            both = (tracks.dof[members] == 3).sum() / max(tracks.count(members).sum(), 1)
             members = members[tracks.count(members) >= MIN_FRAMES - 1]
             scene = scenes[None if whole is None else whole.id]
             moved, way = finder.moved_in(whole, tracks, members, frame), Way.of(body, frame, whole)
-            evidence, counts = with_frame(body.evidence, moved, scene, way, body.far)
+            evidence, counts = with_frame(body.evidence, moved, scene, way, body.far, both)
             body = replace(body, evidence=evidence, certain=body.certain + counts)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= 2 * WINDOW:  # the first holds how it started
