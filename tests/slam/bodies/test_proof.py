@@ -91,7 +91,9 @@ def test_what_goes_farther_than_the_camera_does_not_slide_with_it():
     rng = np.random.default_rng(1)
     moved, jumpy = group(10, 0.05 * ASIDE, 0.01, rng), way(0.05 * ASIDE, 0.03, rng)
     upwards = np.linspace(0, 1, WINDOW)[:, None] * [0, 1.0, 0]
-    proven = [with_frame(0.0, moved, scene(), replace(jumpy, cameras=far * upwards), False, 1.0)[1] for far in (0.1, 3.0)]
+    proven = [
+        with_frame(0.0, moved, scene(), replace(jumpy, cameras=far * upwards), False, 1.0)[1] for far in (0.1, 3.0)
+    ]
     assert proven == [2, 0]
 
 
