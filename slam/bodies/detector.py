@@ -14,6 +14,7 @@ from slam.bodies.bodies import (
     advanced,
     continued,
     hidden,
+    of_bodies,
     reported,
     with_belief,
     with_evidence,
@@ -272,7 +273,7 @@ class MovingObjectDetector(ObjectDetector):
         for id, body in list(self.bodies.items()):
             if body.belief is None and body.measured:
                 mine = np.flatnonzero((tracks.body == id) & tracks.found)
-                seen = observed(body, tracks, mine, tracks.row[mine], frame.features, body.T)
+                seen = observed(body, tracks, mine, frame.features, body.T)
                 belief = self._estimator.updated(None, id, seen, frame.cameras)
                 self.bodies[id] = replace(body, belief=belief, measured_at=frame.features.stamp)
 
@@ -295,7 +296,7 @@ class MovingObjectDetector(ObjectDetector):
 
     def _of_proven(self, tracks: Tracks) -> BoolArray:
         """Which tracks (N,) belong to a body that has moved for certain."""
-        return np.isin(tracks.body, [body.id for body in self.bodies.values() if body.proven])
+        return of_bodies(tracks, (body for body in self.bodies.values() if body.proven))
 
     def _motion_labels(self, tracks: Tracks, frame: Frame) -> MotionLabels:
         n = len(frame.local)
