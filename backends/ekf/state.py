@@ -152,13 +152,12 @@ class FilterState:
         """After an update.
 
         A displacement of camera and landmarks together is unobservable. What it changes in each coordinate depends on
-        the state, though (how far the world's origin is, which way is depth), and an update moves the state. A filter
-        that goes on with the same covariance believes to have measured such displacements, in time very well (Huang,
-        Mourikis and Roumeliotis, 2010). If the camera transports its error, the covariance is therefore transported to
-        the corrected state: the error is taken to be the displacement that the camera's pose has, by its Jacobian in
-        old coordinates and in new, and what it leaves, which stays as it is: the error of an invariant filter (Barrau
-        and Bonnabel, 2015). Parked landmarks do not move, so that their coordinates need none. Raises
-        LinAlgError where the new state is not finite, or a variance is lost in rounding.
+        the state, though, and an update moves the state: a filter that goes on with the same covariance believes to
+        have measured such displacements, in time very well (Huang, Mourikis and Roumeliotis, 2010). So the error is
+        taken apart: into the displacement of the world that the camera's pose is off by, written in the corrected
+        state's coordinates, and what it leaves, which stays as it is. That is the error of an invariant filter (Barrau
+        and Bonnabel, 2015). Parked landmarks do not move: their coordinates need no transport. Raises LinAlgError where
+        the new state is not finite, or a variance is lost in rounding.
         """
         update, camera = found.at.update, found.camera
         marks = self.landmarks.moved(update.coordinates, self._parts()[1], found.change[CAMERA:].reshape(-1, 3))

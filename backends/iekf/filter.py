@@ -12,10 +12,8 @@ inform on it. The filter is an imperfect one in the terms of Barrau and Bonnabel
 other derivatives do depend on the estimate.
 
 The covariance is kept in the state's own coordinates here: ``[δp, θ, δv, δω]`` with ``R = Exp(θ) R̂``, and the
-landmarks' inverse depths, in which a far point's error is Gaussian. They are a linear map of ξ, which depends on the
-estimate: ``ξ = T(χ̂) [δp, θ, …]``. So that what is kept is ``T(χ̂)⁻¹ P_ξ T(χ̂)⁻ᵀ`` at any time, with the invariant
-filter's P_ξ, an update that moves the estimate from χ̂ to χ̂⁺ multiplies by ``T(χ̂⁺)⁻¹ T(χ̂)``: that is the transport of
-`backends.ekf.state.FilterState.corrected`. The transition needs none, as it is exact in these coordinates.
+landmarks' inverse depths, with ``ξ = T(χ̂) [δp, θ, …]``. An update that moves the estimate from χ̂ to χ̂⁺ multiplies them
+by ``T(χ̂⁺)⁻¹ T(χ̂)``, so that P_ξ stays: the transport of `backends.ekf.state.FilterState.corrected`.
 """
 
 from __future__ import annotations
@@ -126,10 +124,8 @@ class IekfConfig:
 class IekfBackend(LandmarkFilter):
     """Right-invariant extended Kalman filter over the camera's motion and the landmarks.
 
-    Gate, update, iteration, recovery, and the landmarks that leave the dense state are those of `backends.ekf`; what is
-    its own is the motion on SO(3) instead of Euler angles, and the invariant error, of which no sequence of
-    linearisations says where the world is (the module says why, and how it is kept). A landmark that leaves the dense
-    state takes its error in the world as it is with it, and comes back to the invariant one.
+    Gate, update, iteration, recovery, and the landmarks that leave the dense state are those of `backends.ekf`; its own
+    are the motion on SO(3) and the invariant error (see the module).
 
     Args:
         rig: the cameras, rectified.

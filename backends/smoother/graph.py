@@ -55,12 +55,15 @@ class Graph:
 
     Its first pose is held firmly, as nothing is measured but relative to it: with a pose that is hardly known in the
     world Cholesky's method would run out of digits. What is known of it is added to all covariances. If landmarks are
-    known in the world the first pose has its own covariance instead. So many poses before the newest one as
-    `lag` says are smoothed with it; None for all.
+    known in the world the first pose has its own covariance instead.
+
+    Attributes:
+        rebuilds: how often it was built anew after a failure.
+        number: of the newest pose in it; −1 for none.
     """
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:
-        self.rebuilds = 0  # how often it was built anew after a failure
+        self.rebuilds = 0
         self._careful = 0  # number of the first pose whose factors may be made quickly again, after a failure
         self._make, self._lag = make, lag
         self.restart()
@@ -75,7 +78,7 @@ class Graph:
             _ENDLESS if self._lag is None else float(self._lag), parameters
         )
         self._tracks = Tracks(self._make, self._lag)
-        self._number, self._taken = -1, 0
+        self.number, self._taken = -1, 0
         self._base: Array = np.zeros((6, 6))  # what is known of the first pose, besides its prior
         self._poses: dict[int, Array] = {}
         self._first = np.eye(4)  # the first pose
@@ -90,8 +93,8 @@ class Graph:
         graph as well.
         """
         why = ""
-        if self._number < s.number and self._is_of(s):
-            number, self._number = self._number, -1  # until it is done: an interrupted call leaves a graph unknown
+        if self.number < s.number and self._is_of(s):
+            number, self.number = self.number, -1  # until it is done: an interrupted call leaves a graph unknown
             try:
                 problem = GraphProblem(to_graph=inverse(self._to_state))
                 return self._update(s, range(number + 1, s.number + 1), problem), ""
@@ -134,7 +137,8 @@ class Graph:
             self._taken = len(s.sights[s.of(number)])
         kept = self._tracks.keep(problem, s)
         made = self._tracks.make_smart(problem, s.number < self._careful)
-        # Nothing leaves before the newest pose is solved for: what leaves fixes where its neighbours are linearised.
+        # Two steps of Gauss and Newton: in the first, nothing leaves. What leaves fixes where its neighbours stay
+        # linearised, and that is to be after the newest pose is solved for.
         now: Stamps = dict.fromkeys(problem.values.keys(), float(before))
         with solving():
             self._solver.update(problem.factors, problem.values, now, problem.removed)
@@ -157,7 +161,7 @@ class Graph:
         spread = np.array([*(self._joint([i]) for i in new[:-1]), joint[-6:, -6:]])
         if not (np.isfinite(poses).all() and np.isfinite(joint).all() and (np.diag(joint) > 0).all()):
             raise SolverError("gtsam: the solution is not finite, or a variance not positive")
-        self._number, self._tie = s.number, s.ties[s.of(s.number)]
+        self.number, self._tie = s.number, s.ties[s.of(s.number)]
         return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, joint, spread)
 
     def joint_covariance(self, s: SmootherState, first: int | None = None) -> tuple[int, Array]:
@@ -169,11 +173,11 @@ class Graph:
         """
         if not self._is_of(s):
             return s.number, s.spread[-1]
-        oldest = self.oldest(s, max(self._number, s.number - (self._lag or 0)))
+        oldest = self.oldest(s, max(self.number, s.number - (self._lag or 0)))
         first = oldest if first is None else max(oldest, first)
-        begin = min(first, self._number)
-        P = self._joint(list(range(begin, self._number + 1)))
-        for tie in s.ties[s.of(self._number) + 1 :]:
+        begin = min(first, self.number)
+        P = self._joint(list(range(begin, self.number + 1)))
+        for tie in s.ties[s.of(self.number) + 1 :]:
             assert tie is not None  # only the pose with which the problem begins has none
             gain, rest = follows(adjoint(inverse(tie.relative)), P[-6:, -6:], tie.shared, tie.covariance)
             cross = gain @ P[-6:]
@@ -190,18 +194,13 @@ class Graph:
         R = self._to_state[:3, :3]
         return np.asarray(R @ self._solver.getISAM2().marginalCovariance(key) @ R.T + J @ self._base @ J.T)
 
-    @property
-    def newest(self) -> int:
-        """Number of the newest pose in it; −1 for none."""
-        return self._number
-
     def _is_of(self, s: SmootherState) -> bool:
         """Whether it is the state's graph, up to poses that entered since the last update.
 
         A pose of that number may be another frame, if the call that had added it was interrupted.
         """
-        known = max(s.begun, s.first) <= self._number <= s.number
-        return known and self._kind == _kind(s) and self._tie is s.ties[s.of(self._number)]
+        known = max(s.begun, s.first) <= self.number <= s.number
+        return known and self._kind == _kind(s) and self._tie is s.ties[s.of(self.number)]
 
     def _joint(self, numbers: list[int]) -> Array:
         keys = [pose_key(i) for i in numbers]
