@@ -152,7 +152,7 @@ def advanced(covariance: Covariance, P: np.ndarray, rng) -> tuple[Covariance, np
         F = np.eye(len(P))
         F[:HEAD, :HEAD] = np.eye(HEAD, k=-6)
         F[:12, :12], F[12:18, :6], F[12:18, 6:12] = J, pose, 0.0
-        covariance, P = covariance.advanced(pose, J, noise), F @ P @ F.T
+        covariance, P = covariance.camera_moved(J, noise, pose), F @ P @ F.T
         P[:12, :12] += noise
     return covariance, P
 
