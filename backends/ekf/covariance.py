@@ -100,7 +100,7 @@ class Covariance:
     def camera_moved(self, J: Array, noise: Array, by_error: Array | None = None) -> Covariance:
         """The camera's error (12,) becomes J times what it was, plus noise (12, 12).
 
-        With `by_error`, the pose before, that (6, 6) times [r, φ], is now the first of the last ones; the last one goes.
+        With `by_error`, the pose before, that (6, 6) times [r, φ], is now the first of the last ones; the last goes.
         """
         F = np.eye(HEAD) if by_error is None else np.eye(HEAD, k=-POSE)
         F[:CAMERA, :CAMERA] = J
