@@ -9,6 +9,7 @@ import shlex
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -17,6 +18,7 @@ from experiments.parameters import find
 from experiments.sensitivity import name_of
 from frontends.surf import SurfConfig
 from slam import worlds
+from slam.errors import SlamError
 from slam.evaluation.metrics import absolute_errors
 from slam.geometry import se3
 from slam.settings import can_be_set
@@ -39,6 +41,28 @@ def test_the_shown_back_end_follows_the_camera():
     results = [system.process_features(sequence.observations(k)) for k in range(len(sequence))]
     assert all(result.status.value == "tracked" for result in results[1:])
     assert absolute_errors(system.trajectory(), sequence.ground_truth).rmse < 0.02  # measured 4 mm, on 25 cm of path
+
+
+def test_a_world_and_a_format_of_one_s_own_are_opened_by_module_and_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(DOCS / "examples")
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    world = slam.open_sequence("synthetic:hall:HALL?frames=3&high=4")
+    for name in "ab":
+        (tmp_path / name).mkdir()
+    c = world.rig.left
+    numbers = {"fx": c.fu, "fy": c.fv, "cx": c.u0, "cy": c.v0, "baseline": world.rig.baseline}
+    (tmp_path / "rig.yaml").write_text("".join(f"{name}: {value}\n" for name, value in numbers.items()))
+    for frame in world:
+        for name, image in (("a", frame.left), ("b", frame.right)):
+            cv2.imwrite(str(tmp_path / name / f"{frame.stamp + 1:.3f}.png"), image)
+    read = slam.open_sequence(tmp_path, "pairs_format:open_folder")
+    assert read.rig.baseline == world.rig.baseline and read.stamps == pytest.approx(world.stamps + 1, abs=1e-3)
+    for one, other in zip(world, read, strict=True):
+        np.testing.assert_array_equal(one.right, other.right)
+    with pytest.raises(SlamError, match=r"is no slam\.worlds\.scenes\.Scene"):
+        slam.open_sequence("synthetic:hall:build")
+    with pytest.raises(SlamError, match=r"format 'numpy:eye': TypeError"):
+        slam.open_sequence(tmp_path, "numpy:eye")
 
 
 @pytest.mark.slow
@@ -147,7 +171,7 @@ def test_settings_exist(page):
 @each_page
 def test_worlds_and_scripts_exist(page):
     text = page.read_text(encoding="utf-8")
-    for name, query in re.findall(r"synthetic:([a-z]+)(?:\?([\w=&.:,]+))?", text):
+    for name, query in re.findall(r"synthetic:([a-z]+)(?!:)\b(?:\?([\w=&.:,]+))?", text):
         worlds.parse_query(name, "" if "key=" in query else query, worlds.options(name))
     for script in re.findall(r"\b(?:python|pytest)(?: -\S+)* ((?:experiments|benchmarks|docs|tests)/\S+?\.py)", text):
         assert (ROOT / script).is_file(), script

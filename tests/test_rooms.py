@@ -38,7 +38,8 @@ MAY_IMPORT = {
     "compare": {"run", "system", "input", "sequences", "worlds", "evaluation", "data", "geometry", "bodies"},
     "testing": {"system", "worlds", "data", "geometry"},
     "commands": {
-        "compare", "run", "bodies", "system", "sequences", "worlds", "evaluation", "data", "geometry", "runtime",
+        "compare", "run", "calibration", "bodies", "system", "sequences", "worlds", "evaluation", "data", "geometry",
+        "runtime",
     },
     "outside": {"run", "system", "atlas", "calibration", "sequences", "data", "geometry", "runtime"},
 }  # fmt: skip

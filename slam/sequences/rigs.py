@@ -111,6 +111,8 @@ def rig_of(entries: Entries, source: Path, size: Size | None, options: Mapping[s
             except ConfigurationError as error:
                 raise CalibrationError(str(error)) from None
         rig = _rig(entries, size, unit, rectified, fisheye)
+    if fisheye and "equidistant" not in (rig.left.model, rig.right.model):
+        raise ConfigurationError(f"option 'fisheye' does nothing with {source}: by it the images have no distortion")
     expected = recorded_size(rig)
     if size not in (None, expected):
         raise SequenceError(f"images are {size_text(size or ())}, but {source} is for {size_text(expected)}")

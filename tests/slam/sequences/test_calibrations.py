@@ -206,6 +206,8 @@ def test_rectified_images_take_the_projection_matrices(tmp_path: Path, build: Si
     assert rig.is_rectified and rig.baseline == pytest.approx(np.linalg.norm(e["T"]), rel=1e-9)
     assert same(slam.load_rig(tmp_path / "p.yml", size=SIZE), rig)
     assert not slam.load_rig(tmp_path / "a.yml", size=SIZE).is_rectified
+    with pytest.raises(ConfigurationError, match=r"'fisheye' does nothing with .*p\.yml"):
+        slam.load_rig(tmp_path / "p.yml", size=SIZE, fisheye=True)
 
 
 def test_distortions_of_every_kind_and_length(tmp_path: Path, build: SimpleNamespace) -> None:
