@@ -18,12 +18,12 @@ from slam import registry
 from slam.errors import ConfigurationError, PartError, SequenceError, SlamError, UnknownNameError, cause
 from slam.files import expanded, note_input, reason
 from slam.naming import nearest, unknown
+from slam.query import read_query
 from slam.sequences import euroc, folders, kitti, ros
 from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, logger, read_masks, turned
 from slam.sequences.folders import VIDEO_SUFFIXES
 from slam.sequences.images import IMAGE_SUFFIXES
 from slam.sequences.options import RECORDED, Options
-from slam.settings import read_query
 
 __all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
 
@@ -143,13 +143,8 @@ def _own(name: str, folder: Path, options: Options, faults: FaultLog) -> Recorde
 def _open_world(text: str) -> Sequence:
     from slam.worlds import open_world
 
-    name, mark, query = text.partition("?")
-    parts = query.split("&")
-    masks = [part for part in parts if part.startswith("mask=")]
-    opened = open_world(name + mark + "&".join(part for part in parts if part not in masks))
-    if masks:
-        opened.masks = read_masks(read_query(masks[-1])["mask"], Path.cwd(), opened.rig)
-        opened.name = text
+    opened = open_world(text)
+    opened.masks = read_masks(opened.values["mask"] or None, Path.cwd(), opened.rig)
     return opened
 
 

@@ -29,7 +29,7 @@ __all__ = ["WorldSequence", "describe", "describe_common", "names", "open_world"
 
 #: Options that change the world itself; the others only change how it is recorded.
 _RECORDING_ONLY = {o.name for o in (*OBSERVATION, *IMAGING, *FAULTS)} - {"density"}
-_RECORDING_ONLY |= {"seed", "focal_error", "turn_error"}
+_RECORDING_ONLY |= {"seed", "mask", "focal_error", "turn_error"}
 
 
 def names() -> list[str]:
