@@ -95,7 +95,7 @@ def print_conclusions(every: Sequence[Group]) -> None:
 
 def empty_table(title: str, names: Iterable[str]) -> Table:
     """An empty table with a column for each name."""
-    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table = Table(title=escape(title) or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("")
     for name in names:
         table.add_column(escape(name), justify="right")

@@ -101,6 +101,6 @@ def test_runs_that_are_not_to_be_trusted_are_a_row_of_a_comparison_where_there_a
 
 def test_names_of_back_ends_are_printed_as_they_are(capsys):
     """`mine:Zero: …` was printed with a picture of the digit."""
-    print_summary([summary(1.0) | {"sequence": "a:fire:", "backend": "mine:Zero"}], [Path("o")])
+    print_summary([summary(1.0) | {"sequence": "a:fire:[b]", "backend": "mine:Zero"}], [Path("o")])
     said = capsys.readouterr().out
-    assert "mine:Zero: covariances hold" in said and "a:fire:" in said
+    assert "mine:Zero: covariances hold" in said and "a:fire:[b]" in said
