@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.data import BoolArray, IdArray, RecentPoses
+from slam.geometry.arrays import Table
 from slam.geometry.se3 import Array, transform
 from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate
@@ -67,7 +68,7 @@ _EXACT = 1e-12 * np.eye(6)  # numerics: [rad², m²]
 
 
 @dataclass(frozen=True, eq=False)
-class Points:
+class Points(Table):
     """Points of a body, a row each."""
 
     ids: IdArray  # (N,), −1 of those that were given up but still take part
@@ -76,22 +77,11 @@ class Points:
     failures: IdArray  # how often running each was rejected (N,)
     unseen: IdArray  # frames since each was seen (N,)
 
-    def __len__(self) -> int:
-        return len(self.ids)
-
     @classmethod
     def new(cls, ids: IdArray, position: Array, local: Array) -> Points:
         """Points at their first sight."""
         none = np.zeros(len(ids), np.int64)
         return cls(ids, position, local, none, none)
-
-    def joined(self, other: Points) -> Points:
-        """These and others."""
-        return Points(*(np.concatenate([mine, its]) for mine, its in zip(vars(self).values(), vars(other).values())))
-
-    def select(self, keep: BoolArray) -> Points:
-        """Some of them."""
-        return Points(*(column[keep] for column in vars(self).values()))
 
 
 @dataclass(frozen=True, eq=False)

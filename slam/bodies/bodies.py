@@ -199,6 +199,14 @@ def outermost(points: Array) -> tuple[Array, Array]:
     return (1 - share) * ordered[k] + share * ordered[k + 1], (1 - share) * ordered[-1 - k] + share * ordered[-2 - k]
 
 
+def of_bodies(tracks: Tracks, bodies: Iterable[Body]) -> BoolArray:
+    """Which tracks (N,) belong to one of the bodies."""
+    mine = np.zeros(len(tracks), bool)
+    for body in bodies:
+        mine |= tracks.body == body.id
+    return mine
+
+
 def in_body_axes(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> tuple[Array, Array, BoolArray]:
     """What tracks measured by slot in body coordinates: points (N, W, 3), information (N, W, 3, 3), and whether any."""
     t = tracks

@@ -14,6 +14,7 @@ from slam.bodies.bodies import (
     advanced,
     continued,
     hidden,
+    of_bodies,
     reported,
     with_belief,
     with_evidence,
@@ -250,10 +251,11 @@ class MovingObjectDetector(ObjectDetector):
             if not body.measured or (whole is not None and whole.id not in scenes):
                 continue
             members = np.flatnonzero((tracks.body == body.id) & tracks.found)
+            both = (tracks.dof[members] == 3).sum() / max(tracks.count(members).sum(), 1)
             members = members[tracks.count(members) >= MIN_FRAMES - 1]
             scene = scenes[None if whole is None else whole.id]
             moved, way = finder.moved_in(whole, tracks, members, frame), Way.of(body, frame, whole)
-            evidence, counts = with_frame(body.evidence, moved, scene, way, body.far)
+            evidence, counts = with_frame(body.evidence, moved, scene, way, body.far, both)
             body = replace(body, evidence=evidence, certain=body.certain + counts)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= 2 * WINDOW:  # the first holds how it started
@@ -271,7 +273,7 @@ class MovingObjectDetector(ObjectDetector):
         for id, body in list(self.bodies.items()):
             if body.belief is None and body.measured:
                 mine = np.flatnonzero((tracks.body == id) & tracks.found)
-                seen = observed(body, tracks, mine, tracks.row[mine], frame.features, body.T)
+                seen = observed(body, tracks, mine, frame.features, body.T)
                 belief = self._estimator.updated(None, id, seen, frame.cameras)
                 self.bodies[id] = replace(body, belief=belief, measured_at=frame.features.stamp)
 
@@ -294,7 +296,7 @@ class MovingObjectDetector(ObjectDetector):
 
     def _of_proven(self, tracks: Tracks) -> BoolArray:
         """Which tracks (N,) belong to a body that has moved for certain."""
-        return np.isin(tracks.body, [body.id for body in self.bodies.values() if body.proven])
+        return of_bodies(tracks, (body for body in self.bodies.values() if body.proven))
 
     def _motion_labels(self, tracks: Tracks, frame: Frame) -> MotionLabels:
         n = len(frame.local)

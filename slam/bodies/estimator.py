@@ -77,8 +77,7 @@ class BodyEstimator:
     ) -> BodyBelief | None:
         """The belief after one more frame, the newest of the camera's `FRAMES` + 1 last poses.
 
-        A body of which nothing is known, or of which nothing agrees with what is known though it was located
-        (`ObjectObservations.T_world_object`), begins anew, if at least three points have a depth; else it stays None.
+        A body of which nothing is known begins anew, if at least three points have a depth; else it stays None.
         """
         measured = after = None
         if seen is not None:
@@ -88,10 +87,9 @@ class BodyEstimator:
         if belief is not None and len(cameras) > 1:
             with suppress(np.linalg.LinAlgError):
                 after = self._followed(belief, id, measured, cameras)
-        lost = after is None or not after.estimate.measured
-        if measured is not None and lost and (belief is None or measured.given.T_world_object is not None):
+        if measured is not None and belief is None:
             with suppress(np.linalg.LinAlgError):
-                return self._begun(id, measured, cameras) or after
+                return self._begun(id, measured, cameras)
         return after
 
     def _begun(self, id: int, seen: _Seen, cameras: RecentPoses) -> BodyBelief | None:
@@ -180,7 +178,7 @@ class BodyEstimator:
         rows, z, ids = rows[known], seen.z[known], seen.given.points[known]
         if not len(rows):
             return None, ids, ids
-        Y, used, scale = self._agreement(expected, rows, z, seen.given.T_world_object, cameras.poses[-1])
+        Y, used, scale = self._agreement(expected, rows, z)
         b = replace(
             b, poses=np.concatenate([b.poses[:-1], Y[None]]), scales=np.append(b.scales[:-1], scale)
         )  # fmt: skip
@@ -201,27 +199,23 @@ class BodyEstimator:
             used[np.flatnonzero(used)[bad]] = False
         return self._after(tried, solution, local, rows, used), ids[used], ids[~used]
 
-    def _agreement(
-        self, expected: _Expected, rows: IndexArray, z: Array, guess: Array | None, X: Array
-    ) -> tuple[Array, BoolArray, float]:
+    def _agreement(self, expected: _Expected, rows: IndexArray, z: Array) -> tuple[Array, BoolArray, float]:
         """The pose on which most observations agree, which ones, and by what factor the impulse must be larger."""
         b = expected.belief
         predicted, points = b.poses[-1], b.points.position[rows]
         local = transform(inverse(predicted), points)
         noise = pose_only.residual_noise(self.stereo, self.sigma, local, expected.local[rows], z)
-        starts = [predicted] + ([] if guess is None else [inverse(guess) @ X])
         most, limit = max(MIN_POINTS, (len(rows) + 1) // 2), chi_square_limit(6, self.gate)
         first = None
         for factor in (0.0, *INFLATION):
             information = np.linalg.inv(expected.covariance + factor**2 * expected.impulse)
             problem = pose_only.PoseProblem(self.stereo, points, z, noise, predicted, information, self.gate)
-            for start in starts:
-                Y, used = pose_only.solve(problem, start)
-                off = log(inverse(predicted) @ Y)
-                tried = Y, used, float(np.hypot(1.0, factor))
-                first = first or tried
-                if len(rows) < most or (used.sum() >= most and off @ information @ off < limit):
-                    return tried
+            Y, used = pose_only.solve(problem, predicted)
+            off = log(inverse(predicted) @ Y)
+            tried = Y, used, float(np.hypot(1.0, factor))
+            first = first or tried
+            if len(rows) < most or (used.sum() >= most and off @ information @ off < limit):
+                return tried
         assert first is not None
         return first
 

@@ -8,31 +8,24 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from slam.bodies.belief import BodyBelief
-from slam.bodies.bodies import Body
+from slam.bodies.bodies import Body, of_bodies
 from slam.bodies.config import MIN_FRAMES, MIN_POINTS
 from slam.bodies.estimator import BodyEstimator
-from slam.bodies.fits import AGREES
 from slam.bodies.frame import Frame
 from slam.bodies.track_kernels import inverses
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among
-from slam.geometry.rig import measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.object_data import ObjectObservations
 from slam.tracks import follow as features_of_tracks
-from slam.tracks.follow import match_everywhere
 from slam.tracks.table import Tracks
-from slam.window.consensus import find_consensus
 
 _SEARCH = 4.0, 25.0  # least and largest half size of the search windows of tracks [px]
 _ALIKE = 0.5, 0.8  # largest descriptor distance, and its largest ratio to the second best
 _UNKNOWN = 1e-6  # numerics: on a member's point that has no information yet [1/m²]
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
 _RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
-_SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
-_HYPOTHESES = 60  # cost: poses tried for a body that is found again
-_DEPTHS = 0.2  # share of the depth by which stereo may be off
 
 
 def follow(tracks: Tracks, bodies: Mapping[int, Body], frame: Frame) -> None:
@@ -45,19 +38,15 @@ def follow(tracks: Tracks, bodies: Mapping[int, Body], frame: Frame) -> None:
     """
     alive = np.flatnonzero(tracks.number >= 0)
     _advance(tracks, bodies, alive, frame.dt)
-    lost = np.isin(tracks.body[alive], [body.id for body in bodies.values() if body.missed > 1])
+    lost = of_bodies(tracks, (body for body in bodies.values() if body.missed > 1))
     taken = among(len(frame.local), tracks.row[tracks.row >= 0])
-    _look(tracks, frame, alive[~lost & (tracks.row[alive] < 0)], taken)
-    of_lost = alive[lost]
-    of_others = np.setdiff1d(np.flatnonzero(tracks.found & (tracks.body >= 0)), of_lost)
-    held = among(len(taken), tracks.row[of_others])
+    _look(tracks, frame, alive[(~lost & (tracks.row < 0))[alive]], taken)
+    held = among(len(taken), tracks.row[tracks.found & (tracks.body >= 0) & ~lost])
     _far(tracks, frame, taken)
-    _look(tracks, frame, of_lost[tracks.row[of_lost] < 0], held)
-    found = np.flatnonzero(tracks.found)
-    tracks.unfound[:] += 1
-    tracks.unfound[found] = 0
-    found = np.setdiff1d(found, of_lost)
-    tracks.look[found] = frame.features.descriptors[tracks.row[found]]
+    _look(tracks, frame, np.flatnonzero(lost & (tracks.row < 0)), held)
+    tracks.unfound[:] = np.where(tracks.found, 0, tracks.unfound + 1)
+    seen = np.flatnonzero(tracks.found & ~lost)
+    tracks.look[seen] = frame.features.descriptors[tracks.row[seen]]
 
 
 def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: IndexArray, dt: float) -> None:
@@ -116,107 +105,36 @@ def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
 
 
 def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) -> BodyBelief | None:
-    """What is believed of a body after this frame, by its tracks that are seen, or found again; None for nothing.
+    """What is believed of a body after this frame, by its tracks that are seen; None for nothing.
 
-    Tracks that the estimate did not use are counted as misfits, in place, but followed on: they may lie on a part that
-    moves otherwise, such as a lid.
+    Tracks that the estimate used keep their features, and no free track has these, in place. The others are counted as
+    misfits, but followed on: they may lie on a part that moves otherwise, such as a lid.
     """
-    features = frame.features
-    members = np.flatnonzero(tracks.body == body.id)
-    mine = members[tracks.found[members]]
+    mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
+    anywhere = len(mine) < MIN_POINTS and np.trace(body.covariance[3:, 3:]) > body.across**2
+    some = mine[:0] if anywhere else mine  # else any two points agree with one of its poses
+    belief = estimator.updated(body.belief, body.id, observed(body, tracks, some, frame.features), frame.cameras)
     rows = tracks.row[mine]
-
-    def estimated(mine: IndexArray, rows: IndexArray, T: Array | None = None) -> BodyBelief | None:
-        return estimator.updated(body.belief, body.id, observed(body, tracks, mine, rows, features, T), frame.cameras)
-
-    def agreeing(belief: BodyBelief | None) -> int:
-        return len(belief.estimate.used) if belief is not None and belief.estimate.measured else 0
-
-    asked = slice(None) if _is_expected(body) else slice(0)  # else any two points agree with one of its poses
-    belief = estimated(mine[asked], rows[asked])
-    if 2 * agreeing(belief) < len(mine) or not len(mine):
-        for some, theirs in ((mine, rows), _by_descriptors(body, tracks, members, frame)):
-            fit = _fit(body, tracks, some, theirs, frame)
-            if fit is None or fit[1].sum() <= agreeing(belief):
-                continue
-            T = np.asarray(frame.T_world_left @ inverse(fit[0]))
-            if not _is_within_reach(body, T, frame):
-                continue
-            again = estimated(some[fit[1]], theirs[fit[1]], T)
-            if agreeing(again) > agreeing(belief):
-                belief, mine, rows = again, some, theirs
-    followed = tracks.row[members]
-    tracks.row[members] = -1
+    tracks.row[mine] = -1
     if belief is None or not belief.estimate.measured:
         return belief
     agrees = np.isin(tracks.number[mine], belief.estimate.used)
-    taken = among(len(features), tracks.row[tracks.found])
-    tracks.row[members] = np.where(taken[followed], -1, followed)  # those that were not seen stay at −1
     tracks.misfit[mine] = np.where(agrees, 0, tracks.misfit[mine] + 1)
-    good, matched = mine[agrees], rows[agrees]
-    measured_now = among(len(features), matched)
-    tracks.row[members[measured_now[followed] & (followed >= 0)]] = -1
     free = np.flatnonzero((tracks.body < 0) & tracks.found)
-    tracks.give_up(free[measured_now[tracks.row[free]]])
-    tracks.row[good], tracks.unfound[good] = matched, 0
-    tracks.look[good] = features.descriptors[matched]
+    tracks.give_up(free[np.isin(tracks.row[free], rows[agrees])])
+    left = agrees | ~np.isin(rows, tracks.row[tracks.found])
+    tracks.row[mine[left]] = rows[left]
+    tracks.look[mine[agrees]] = frame.features.descriptors[rows[agrees]]
     return belief
 
 
 def observed(
-    body: Body, tracks: Tracks, mine: IndexArray, rows: IndexArray, features: StereoFeatures,
-    T: Array | None = None,
-) -> ObjectObservations:  # fmt: skip
-    """A body's tracks (K,) as the features of these rows, with a guess of its pose (4, 4) where there is one."""
-    order = np.argsort(tracks.number[mine])
-    rows = rows[order]
+    body: Body, tracks: Tracks, mine: IndexArray, features: StereoFeatures, T: Array | None = None
+) -> ObjectObservations:
+    """A body's seen tracks (K,), with a guess of its pose (4, 4) where there is one."""
+    order = mine[np.argsort(tracks.number[mine])]
+    rows = tracks.row[order]
     return ObjectObservations(
-        body.id, tracks.number[mine[order]], features.uv_left[rows], features.uv_right[rows], T, body.velocity,
+        body.id, tracks.number[order], features.uv_left[rows], features.uv_right[rows], T, body.velocity,
         np.sqrt(body.velocity_covariance.diagonal()),
     )  # fmt: skip
-
-
-def _is_within_reach(body: Body, T: Array, frame: Frame) -> bool:
-    """Whether a body that is found again at a pose (4, 4) can have gone there from where it was predicted."""
-    R, view = body.T[:3, :3], frame.T_world_left[:3, :3]
-    local = transform(inverse(frame.T_world_left), T[None, :3, 3])
-    noise = frame.setup.rig.triangulation_covariance(local, frame.setup.sigma)[0]
-    gap = T[:3, 3] - body.T[:3, 3]
-    return bool(gap @ np.linalg.solve(R @ body.covariance[3:, 3:] @ R.T + view @ noise @ view.T, gap) < AGREES)
-
-
-def _is_expected(body: Body) -> bool:
-    """Whether it is known where the body is to within what it measures across."""
-    return bool(np.trace(body.covariance[3:, 3:]) <= body.across**2)
-
-
-def _fit(
-    body: Body, tracks: Tracks, mine: IndexArray, rows: IndexArray, frame: Frame
-) -> tuple[Array, BoolArray] | None:
-    """Pose T_body_left, and which tracks agree with it as the features of these rows."""
-    if len(mine) < MIN_POINTS:
-        return None
-    rig, limit = frame.setup.rig, _SIGMAS * frame.setup.sigma
-    z = measurement_rows(frame.features.uv_left[rows], frame.features.uv_right[rows])
-    guess = inverse(body.T) @ frame.T_world_left
-    fit = find_consensus(rig, tracks.local[mine], z, guess, limit, _HYPOTHESES, frame.number)
-    stereo = np.isfinite(z[fit.inliers, 2])
-    return None if stereo.sum() < MIN_POINTS else (fit.T_world_left, fit.inliers)
-
-
-def _by_descriptors(body: Body, tracks: Tracks, mine: IndexArray, frame: Frame) -> tuple[IndexArray, IndexArray]:
-    """Members matched by descriptor, and the features' rows, no farther off than the body can have gone.
-
-    Features of free tracks may be matched, too: such tracks may have started on the body's points.
-    """
-    features, c = frame.features, frame.setup.config
-    taken = among(len(features), tracks.row[tracks.found & (tracks.body >= 0) & (tracks.body != body.id)])
-    free = np.flatnonzero(~taken & np.isfinite(frame.local[:, 0]))
-    if len(mine) < MIN_POINTS or len(free) < MIN_POINTS:
-        return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    local = frame.local[free]
-    away = np.linalg.norm(transform(frame.T_world_left, local) - body.T[:3, 3], axis=1)
-    reach = c.max_speed * max(features.stamp - body.seen_at, 0.1) + float(np.linalg.norm(body.upper - body.lower))
-    allowed = np.broadcast_to(away < reach + _DEPTHS * np.abs(local[:, 2]), (len(mine), len(free)))
-    found = match_everywhere(tracks.look[mine], tracks.laplacian[mine], features.select(free), *_ALIKE, allowed)
-    return mine[found.tracks], free[found.features]

@@ -14,6 +14,10 @@ the window, or those of its ends, must lie along a way better than they scatter 
 jumps, and a body goes on. Nor does it turn: how surely the members turn, as a whole, counts as much as the way does.
 What the way has in common with that of the camera says nothing: where an edge crosses the picture of one farther off,
 or a match is wrong by a constant disparity, the place goes a share of the camera's way.
+
+Along a repeated pattern, a rail before pipes for instance, matches in the right image can be wrong for all members
+alike, by a disparity that changes with the view. Nothing in their way tells. But such features find no match in the
+right image in half of their frames, those of bodies in one of fifteen.
 """
 
 from __future__ import annotations
@@ -34,6 +38,7 @@ from slam.geometry.se3 import Array, inverse, points_by_pose
 PROVEN = 12.0  #: −log10 of the chance from which a frame proves that a body moves that went farther than the camera
 _SLIDES = 20.0  # the same elsewhere: what slides with the camera was seen to agree by up to 1e-16
 _FARTHER = 2.0  # times the camera's way; from 2 to 4 nothing changes, at 1 what slides in EuRoC MH_01 is a body
+_BOTH = 0.75  # share of measurements that both cameras make: of bodies 0.93, with wrong matches 0.5
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
 _MOST = 40.0  # numerics: of the evidence of a frame
 _WEAK = 1e-9  # numerics: of variance [m²]
@@ -83,19 +88,22 @@ class Way:
         return np.asarray(self.places - np.clip(share, 0.0, 1.0) * camera)
 
 
-def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, int]:
+def with_frame(
+    evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool, both: float
+) -> tuple[float, int]:  # fmt: skip
     """The evidence that a body moves still, after one more frame, and what this frame counts for its `PROOF`.
 
     The evidence is a cumulative sum of −log10 of the chance that the weaker test gives; it fades while a body rests.
-    For a body that was followed `far`, for farther than it is wide, its way alone counts.
+    For a body that was followed `far`, for farther than it is wide, its way alone counts. Both cameras made the share
+    `both` of the members' measurements.
     """
     says, turns, bar = _by_frames(way.places if far else way.beside_camera(), way.times), 0.0, way.bar
     if len(moved.d) < MIN_POINTS:
-        return evidence, 2 * (far and says >= bar)
+        return evidence, 2 * (far and says >= bar and both >= _BOTH)
     if not far:
         by_members, turns = _by_members(moved, scene, way.by_rig)
         says = min(says, by_members)
-    counts = 0 if says < max(0.5 * PROVEN, bar - turns) else 2 if says >= PROVEN else 1
+    counts = 0 if both < _BOTH or says < max(0.5 * PROVEN, bar - turns) else 2 if says >= PROVEN else 1
     return max(0.0, evidence + says - _ALLOWANCE), counts
 
 

@@ -69,6 +69,17 @@ def test_landmarks_on_what_may_be_a_body_do_not_measure_the_camera():
     assert frames
 
 
+def test_what_finds_a_right_match_in_half_of_its_frames_only_is_no_body():
+    """Such matches may all be wrong alike: here they are right, and the box that moves is not reported."""
+    sequence, rng = slam.open_sequence("synthetic:box?density=300"), np.random.default_rng(0)
+    system = system_for(sequence)
+    for k in range(50, 90):
+        seen = sequence.simulate(k)
+        seen.features.uv_right[(seen.objects == 1) & (rng.random(len(seen.objects)) < 0.5)] = np.nan
+        assert not system.process_features(seen.features).objects
+    assert system.objects.bodies
+
+
 def test_nothing_moves_in_a_still_world():
     sequence = slam.open_sequence("synthetic:desk?density=150")
     system = system_for(sequence)

@@ -213,19 +213,6 @@ def test_a_motion_that_no_body_makes_is_refused():
     assert max(np.linalg.norm(e.velocity[3:]) for e in estimates) <= 0.6
 
 
-def test_a_body_that_is_elsewhere_begins_anew_where_it_is_said_to_be():
-    scene = box_scene(seed=5, frames=12, still=True)
-    away = se3.pose(np.eye(3), [0.2, 0, 0])
-    moved = replace(scene, body=np.where((np.arange(12) < 8)[:, None, None], scene.body, away))
-    slow = replace(moved.models, objects=replace(moved.models.objects, max_acceleration=1e-3, acceleration=0.01))
-    start = se3.pose(np.eye(3), scene.points.mean(axis=0))
-    rule = lambda k, o: replace(o, T_world_object=moved.body[k] @ start)  # noqa: E731
-    beliefs = [b for _, b, _ in follow("window", replace(moved, models=slow), rule=rule)]
-    assert all(b.since == 0.0 for b in beliefs[:8]) and beliefs[8].since == moved.stamps[8]
-    assert beliefs[8].estimate.measured and all(b.since == moved.stamps[8] for b in beliefs[8:])
-    assert beliefs[-1].estimate.T_world_object[:3, 3] == pytest.approx(start[:3, 3] + [0.2, 0, 0], abs=0.02)
-
-
 def test_a_point_that_was_given_up_leaves_with_all_its_measurements():
     """They are in what is known of the others from then on: kept as well, they would count twice."""
     scene_ = box_scene(0, FRAMES + 3)

@@ -42,12 +42,12 @@ def way(motion: np.ndarray, jumps: float, rng: np.random.Generator, by_rig: np.n
 
 def result(
     motion: np.ndarray = 0.05 * ASIDE, noise: float = 0.01, jumps: float = 0.01, still: Scene | None = None,
-    by_rig: np.ndarray = NONE, far: bool = False, members: np.ndarray | None = None,
+    by_rig: np.ndarray = NONE, far: bool = False, members: np.ndarray | None = None, both: float = 1.0,
 ) -> tuple[float, int]:  # fmt: skip
     """Evidence of the first frame for ten members, and what it counts; they may show another motion."""
     rng = np.random.default_rng(1)
     moved = group(10, motion if members is None else members, noise, rng)
-    return with_frame(0.0, moved, scene() if still is None else still, way(motion, jumps, rng, by_rig), far)
+    return with_frame(0.0, moved, scene() if still is None else still, way(motion, jumps, rng, by_rig), far, both)
 
 
 @pytest.mark.parametrize("n", [4, 8, 20])
@@ -57,7 +57,7 @@ def test_still_groups_are_not_proven(n, scatter):
     rng = np.random.default_rng(n)
     for _ in range(1000):
         moved = group(n, 0 * ASIDE, 0.01, rng, scatter)
-        assert not with_frame(0.0, moved, scene(), way(0 * ASIDE, 0.01, rng), False)[1]
+        assert not with_frame(0.0, moved, scene(), way(0 * ASIDE, 0.01, rng), False, 1.0)[1]
 
 
 @pytest.mark.parametrize(
@@ -72,6 +72,8 @@ def test_still_groups_are_not_proven(n, scatter):
         (False, {"members": 0 * ASIDE}),
         (True, {"members": 0 * ASIDE, "far": True}),  # it went farther than it is wide: its way alone counts
         (False, {"jumps": 0.3, "far": True}),
+        (False, {"both": 0.5}),  # the right image's matches are wrong for all alike, as along a repeated pattern
+        (False, {"both": 0.5, "far": True}),
     ],
 )
 def test_what_moves_for_certain(certain, given):
@@ -89,7 +91,9 @@ def test_what_goes_farther_than_the_camera_does_not_slide_with_it():
     rng = np.random.default_rng(1)
     moved, jumpy = group(10, 0.05 * ASIDE, 0.01, rng), way(0.05 * ASIDE, 0.03, rng)
     upwards = np.linspace(0, 1, WINDOW)[:, None] * [0, 1.0, 0]
-    proven = [with_frame(0.0, moved, scene(), replace(jumpy, cameras=far * upwards), False)[1] for far in (0.1, 3.0)]
+    proven = [
+        with_frame(0.0, moved, scene(), replace(jumpy, cameras=far * upwards), False, 1.0)[1] for far in (0.1, 3.0)
+    ]
     assert proven == [2, 0]
 
 
@@ -101,7 +105,7 @@ def test_what_goes_a_share_of_the_cameras_way_may_stand_still(share, across, cer
     cameras = 0.05 * frames * [1.0, 0.2, 0] + 0.002 * frames**2 * [0, 0, 1.0]
     middle = share * cameras + across * frames * [0, 0, 1.0] + 1e-3 * rng.standard_normal((WINDOW, 3))
     went = Way(middle[:, None] + ENDS, 0.1 * frames[:, 0], NONE, cameras)
-    assert with_frame(0.0, group(10, 0.05 * ASIDE, 0.01, rng), scene(), went, False)[1] == certain
+    assert with_frame(0.0, group(10, 0.05 * ASIDE, 0.01, rng), scene(), went, False, 1.0)[1] == certain
 
 
 def test_the_common_motion_of_the_scene_is_none_of_the_bodys():
@@ -111,13 +115,13 @@ def test_the_common_motion_of_the_scene_is_none_of_the_bodys():
     by_common = -(moved.lag[:, None, None] * points_by_pose(moved.points)) @ common
     along = Displacements(moved.points, moved.d + by_common, moved.W, moved.lag)
     still = Scene([], np.zeros(0), common, 1e-12 * np.eye(6))
-    assert with_frame(0.0, along, still, way(0 * ASIDE, 0.01, rng), False) == (0.0, 0)
+    assert with_frame(0.0, along, still, way(0 * ASIDE, 0.01, rng), False, 1.0) == (0.0, 0)
 
 
 def test_evidence_fades_while_a_body_rests():
     rng = np.random.default_rng(3)
     known, _ = result()
-    rests, _ = with_frame(known, group(10, 0 * ASIDE, 0.01, rng), scene(), way(0 * ASIDE, 0.01, rng), False)
+    rests, _ = with_frame(known, group(10, 0 * ASIDE, 0.01, rng), scene(), way(0 * ASIDE, 0.01, rng), False, 1.0)
     assert 0 < rests < known
     assert known > PROVEN
 

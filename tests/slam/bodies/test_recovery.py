@@ -1,4 +1,4 @@
-"""Where a body is, by the few points that are seen of it, or by what looks like it."""
+"""Where a body is, by the few points that are seen of it."""
 
 from __future__ import annotations
 
@@ -103,25 +103,6 @@ def test_a_point_that_disagrees_is_followed_on_and_counted():
     assert place(body, tracks, features) is not None
     assert tracks.row[:4].tolist() == [0, 1, 2, 3]
     assert tracks.misfit[:4].tolist() == [0, 0, 0, 1]
-
-
-FAR = np.array([0.0, 0.0, 0.0, 4.0, 0.0, 1.0])
-
-
-def test_a_body_seen_again_takes_its_points_from_the_tracks_that_follow_them():
-    body, tracks, features, truth = scene(4, FAR, np.random.default_rng(6), deviation=2.0)
-    tracks.row[:4] = -1
-    followers = begin(tracks, features, np.arange(4), transform(truth, POINTS))
-    T = place(body, tracks, features)
-    assert T is not None and np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.5
-    assert tracks.row[:4].tolist() == [0, 1, 2, 3]
-    assert (tracks.number[followers] == -1).all()
-
-
-def test_what_looks_like_a_body_where_that_cannot_have_gone_is_not_it():
-    body, tracks, features, _ = scene(4, FAR, np.random.default_rng(6))  # off by eight of its standard deviations
-    tracks.row[:4] = -1
-    assert place(body, tracks, features) is None
 
 
 def test_two_points_do_not_place_a_body_that_may_be_anywhere():
