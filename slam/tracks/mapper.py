@@ -200,19 +200,15 @@ def depth_is_known(
     return np.asarray(rig.depth_deviation(points, pixel_sigma) < limit * points[:, 2])
 
 
-def surplus_landmarks(landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
-    """Which landmarks (N,) to erase so that `max_landmarks` remain.
+def surplus_landmarks(landmarks: LandmarkTable, config: MapConfig) -> IndexArray:
+    """Rows (K,) of the landmarks to erase so that `max_landmarks` remain, of a map that has more.
 
     First those that were measured in a single frame, then the others by their last measurement, oldest first; those
     measured in the newest frame last.
     """
-    out = np.zeros(len(landmarks.ids), bool)
-    surplus = len(out) - config.max_landmarks
-    if surplus > 0:
-        now = landmarks.last_seen == landmarks.last_seen.max()
-        order = np.lexsort((landmarks.last_seen, landmarks.seen > 1, now))
-        out[order[:surplus]] = True
-    return out
+    now = landmarks.last_seen == landmarks.last_seen.max()
+    order = np.lexsort((landmarks.last_seen, landmarks.seen > 1, now))
+    return np.sort(order[: len(order) - config.max_landmarks])
 
 
 def take_census(
@@ -237,11 +233,11 @@ def take_census(
     order = np.argsort(f.uv_left[:, 0], kind="stable")
     counts = t.seen, t.in_view, t.missed, t.last_seen, t.out_of_view, t.unseen
     seen = np.ascontiguousarray(f.uv_left), f.descriptors, f.laplacian, order
-    size = float(rig.left.width), float(rig.left.height)
-    limits = c.view_margin, c.occlusion_radius, c.same_distance, c.same_descriptor
+    inside = expected & rig.left.in_image(view.uv_left, c.view_margin)
+    limits = c.occlusion_radius, c.same_distance, c.same_descriptor
     replaceable = bool(f.has_stereo.any() or not len(f))
     kept = c.erase_missed, c.erase_share, c.confirmed, c.forget_after, float(c.spacing)
     return census(
-        rows, counts, t.seen_from, t.descriptors, t.laplacian, tuple(view), expected, measured, withheld, frame, seen,
-        size, limits, replaceable, kept,
+        rows, counts, t.seen_from, t.descriptors, t.laplacian, tuple(view), inside, measured, withheld, frame, seen,
+        limits, replaceable, kept,
     )  # fmt: skip
