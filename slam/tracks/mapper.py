@@ -217,17 +217,14 @@ def take_census(
 ) -> tuple[BoolArray, BoolArray]:  # fmt: skip
     """Count a frame for the landmarks at `rows` (N,), in place; which of them go, and which features (F,) are of one.
 
-    Of those `expected` (N,), the ones that are near the border or hidden, among features most of which are clearly
-    nearer, are not missed; nor are those `withheld` (N,) from the update, for which the frame counts as neither missed
-    nor seen. `measured` (N,) says which were measured. A landmark goes if it
+    An `expected` landmark (N,) that was not `measured` (N,) was missed, unless it is near the border, hidden by nearer
+    features, or `withheld` (N,) from the update. A landmark goes if it
 
-    - duplicates another one in view that was seen more often, or as often and is older. A feature's depth may differ
-      from a landmark's by stereo's uncertainty, else their points have to be the same;
+    - duplicates another one in view that was seen more often, or as often and is older;
     - is not continuously detected although in view (paper A, IV): missed too often in a row, seen in too small a share
       of the frames, or never confirmed; or was not seen for longer than a map remembers. Where no feature could take
       its place it stays, and one of a loaded map until this run has seen it;
-    - has just gone out of view, close to another one out of view that was seen more often, or is that other one, see
-      `MapConfig.spacing`. Those of a loaded map that this run has not seen yet are only such others.
+    - is out of view, and one of the two has just gone out of view that are closer than `MapConfig.spacing` allows.
     """
     t, c, f = table, config, features
     order = np.argsort(f.uv_left[:, 0], kind="stable")
