@@ -113,7 +113,7 @@ class BodyEstimator:
         cameras = _of(cameras, np.append(b.stamps, cameras.stamps[-1]))
         earlier = _of(cameras, b.stamps)
         if len(b) >= FRAMES:
-            b = slid(b, self.stereo, carried(b, earlier, self.models))
+            b = slid(b, self.stereo, carried(b, earlier, self.models), self.models.drift / self.stereo.f)
             cameras, earlier = _of(cameras, cameras.stamps[1:]), _of(cameras, b.stamps)
         expected = self._expected(b, cameras)
         rejected = none = np.zeros(0, np.int64)
@@ -246,7 +246,7 @@ class BodyEstimator:
         ids[gone] = -1
         h = seen.local[which]
         own = self.stereo.rig.triangulation_covariance(h, self.sigma)
-        new_points = Points.new(seen.given.points[which], transform(b.poses[-1], h), own)
+        new_points = Points.new(seen.given.points[which], transform(b.poses[-1], h), own, b.poses[-1][:3, 3])
         at = len(ids) + np.arange(len(which))
         points = replace(b.points, ids=ids).joined(new_points)
         return replace(
