@@ -26,8 +26,9 @@ from experiments.tables import markdown, picture, write_json
 from slam.atlas.atlas import Atlas
 from slam.config import SystemConfig
 from slam.data import FrameResult
+from slam.evaluation.metrics import absolute_errors
 from slam.geometry.se3 import inverse, log
-from slam.geometry.trajectory import Trajectory, align_positions
+from slam.geometry.trajectory import Trajectory
 from slam.registry import ONLINE
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
@@ -85,9 +86,8 @@ def _light(result: FrameResult) -> FrameResult:
 
 def ate(poses: np.ndarray, truth: np.ndarray) -> float:
     """Root mean square error of the positions after alignment [m]."""
-    p, q = poses[:, :3, 3], truth[:, :3, 3]
-    error = align_positions(p, q).apply(p) - q
-    return float(np.sqrt((error**2).sum(axis=1).mean()))
+    stamps = np.arange(len(poses))
+    return absolute_errors(Trajectory(stamps, poses), Trajectory(stamps, truth)).rmse
 
 
 def false_loops(run: Drive) -> int:

@@ -21,8 +21,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from experiments.common import recordings, script_options
 from experiments.tables import picture, show
 from slam.config import SystemConfig
-from slam.evaluation.metrics import align, associate
-from slam.geometry.trajectory import Trajectory
+from slam.evaluation.metrics import associate
+from slam.geometry.se3 import transform
+from slam.geometry.trajectory import Trajectory, alignment
 from slam.registry import ONLINE
 from slam.run.options import RunOptions
 from slam.run.runner import run
@@ -84,7 +85,7 @@ def true_path(folder: Path, estimate: Trajectory) -> np.ndarray | None:
     if truth is None:
         return None
     own, true = associate(estimate, truth)
-    return align(true, own).apply(true.positions)
+    return transform(alignment(true, own), true.positions)
 
 
 def main() -> int:

@@ -8,7 +8,7 @@ seconds. Pose covariances are (6, 6), order [rotation, translation], of a pertur
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
 from typing import Protocol
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slam.checks import FARTHEST_PIXEL
 from slam.errors import MeasurementError
-from slam.geometry.arrays import Array, ascending
+from slam.geometry.arrays import Array, ascending, changed
 from slam.geometry.arrays import BoolArray as BoolArray
 from slam.geometry.arrays import IdArray as IdArray
 from slam.geometry.arrays import IndexArray as IndexArray
@@ -113,7 +113,7 @@ class StereoFeatures:
 
     def select(self, rows: NDArray) -> StereoFeatures:
         """The features of these rows (a mask or indices)."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
+        return changed(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
     @classmethod
     def empty(cls, stamp: float, dimensions: int = 64, threshold: float = float("nan")) -> StereoFeatures:

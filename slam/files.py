@@ -34,7 +34,6 @@ _AT_LEAST, _TIMES = 64 * 2**20, 50
 
 _MEMBERS = 100  # most members of an archive
 _KINDS = "biufU"  # of arrays: numbers and text, never objects
-_TEXT = 2**20  # characters of a text that is read as JSON
 
 _inputs: ContextVar[list[Path] | None] = ContextVar("inputs", default=None)
 
@@ -92,10 +91,7 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT, error: type[SlamError] 
 
 def read_object(path: str | Path) -> dict[str, Any]:
     """The object in a JSON file; raises SlamError where it cannot be read, or holds something else."""
-    try:
-        tree = json.loads(read_text(path, _JSON_LIMIT, SlamError))
-    except (ValueError, RecursionError) as fault:
-        raise SlamError(f"{path}: no valid JSON: {fault}") from fault
+    tree = json_text(read_text(path, _JSON_LIMIT, SlamError), str(path))
     if not isinstance(tree, dict):
         raise SlamError(f"{path}: must hold an object, not {type(tree).__name__}")
     return tree
@@ -136,7 +132,7 @@ def array(data: bytes, name: str, source: str, error: type[SlamError] = SlamErro
 
 def json_text(text: str | bytes, source: str, error: type[SlamError] = SlamError) -> Any:
     """Parse a JSON text; raises `error` where it is no JSON, or too long."""
-    if len(text) > _TEXT:
+    if len(text) > _JSON_LIMIT:
         raise error(f"{source}: {len(text)} characters of JSON")
     try:
         return json.loads(text)

@@ -1,11 +1,10 @@
-"""``section.key=value`` settings, put into a tree of plain types; and the options ``key=value`` of a sequence."""
+"""``section.key=value`` settings, put into a tree of plain types."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
-from urllib.parse import unquote
 
 from slam.errors import ConfigurationError
 from slam.naming import suggestion, unknown
@@ -119,14 +118,3 @@ def leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[str]:
             yield from leaves(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}"
-
-
-def read_query(query: str) -> dict[str, str]:
-    """The options ``key=value&key=value`` as texts; ConfigurationError where one stands twice, or holds a NUL."""
-    texts: dict[str, str] = {}
-    for part in filter(None, query.split("&")):
-        key, text = (unquote(word) for word in part.partition("=")[::2])
-        if key in texts or "\0" in text:
-            raise ConfigurationError(f"option {key!r} {'is given twice' if key in texts else 'holds a NUL'}")
-        texts[key] = text
-    return texts

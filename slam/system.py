@@ -17,6 +17,7 @@ from slam.calibration import SavedCalibration, SelfCalibration
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError, SlamError
+from slam.geometry.arrays import changed
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import transform
 from slam.geometry.trajectory import Trajectory
@@ -165,6 +166,7 @@ class StereoSlam:
         """Indices of the frames in which another back end took over: a kidnapped camera, or a new map."""
         return list(self._state.restarted)
 
+    @one_blas_thread
     def process(
         self, left: StereoFrame | np.ndarray, right: np.ndarray | None = None, stamp: float | None = None
     ) -> FrameResult:
@@ -230,7 +232,7 @@ class StereoSlam:
             result = self._process(extracted.features, extracted.checksum)
         if result.reason == REPEATED:
             self._extractor.input_warnings.note_repeated(extracted.frame.index)
-        return replace(result, milliseconds={**extracted.milliseconds, **result.milliseconds})
+        return changed(result, milliseconds={**extracted.milliseconds, **result.milliseconds})
 
     def _named(self, place: str) -> AbstractContextManager[None]:
         """Make exceptions of third-party parts say what failed, and where."""
@@ -292,7 +294,7 @@ class StereoSlam:
         step, atlas = done
         if state is not self._state:
             step = session.with_takeover(self._state, state, step)
-        step = replace(step, repeated=repeated)
+        step = changed(step, repeated=repeated)
         common = tracker.rig_error.common(state.backend, as_reported=True)
         result = frame_result(step, atlas, state.ever_mapped, revision, self._stages.milliseconds, common)
         self._moment.add(features, step.estimate.T_world_left, result.status.measured)

@@ -30,7 +30,7 @@ from slam.data import (
     UpdateReport,
     UpdateStatus,
 )  # fmt: skip
-from slam.geometry.arrays import Array, isin
+from slam.geometry.arrays import Array, changed, isin
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
@@ -74,9 +74,9 @@ class State:
     def after(self, step: Step, atlas: Atlas, checksum: tuple[int, int] | None) -> State:
         """The state after one more frame."""
         located = not step.tracking.unmeasured or not self.ever_mapped or self.begins_at(step.index)
-        return replace(
+        return changed(
             self, tracks=step.tracks, atlas=atlas, index=step.index, tracking=step.tracking,
-            standing=replace(step.standing, T_world_left=step.estimate.T_world_left),
+            standing=changed(step.standing, T_world_left=step.estimate.T_world_left),
             checksum=checksum, ever_mapped=self.ever_mapped or len(step.added) > 0,
             dimensions=step.features.descriptors.shape[1] if len(step.features) else self.dimensions,
             measured_at=step.features.stamp if located else self.measured_at,
@@ -172,11 +172,11 @@ class Tracker:
             aligned = align(self.rig, self._aligning, features, matches, tracks, backend.positions)
         if aligned is not features:
             corrected = _shifted_as(corrected, features, aligned)
-        step = Step(index, aligned, replace(corrected, images=None), prediction, tracks, matches, standing, tracking)
+        step = Step(index, aligned, changed(corrected, images=None), prediction, tracks, matches, standing, tracking)
         suspects = self._suspects(step)
         matches = matches.select(~isin(matches.ids, suspects))
         tracks.set_features(tracks.rows(matches.ids), matches.rows)
-        return replace(step, matches=matches, suspects=suspects)
+        return changed(step, matches=matches, suspects=suspects)
 
     def _suspects(self, step: Step) -> IdArray:
         """Ids of landmarks that may move; while the camera stands, all matched ones that do not stay where they are."""
@@ -211,13 +211,13 @@ class Tracker:
             and c.atlas.enabled and len(state.atlas) > 0 and self._can_restart
         ):  # fmt: skip
             return Elsewhere(None)
-        return replace(step, report=report, tracking=tracking)
+        return changed(step, report=report, tracking=tracking)
 
     def estimate(self, state: State, step: Step) -> Step:
         """The camera's pose after an update; the rig's calibration learns from the frame."""
-        self.calibration.observe(replace(step.measured, images=None), step.pose)
+        self.calibration.observe(changed(step.measured, images=None), step.pose)
         estimate: Estimate = checked(state.backend, "estimate", state.backend.estimate(landmarks=False))
-        return replace(step, estimate=estimate)
+        return changed(step, estimate=estimate)
 
     def classify(self, state: State, step: Step) -> Step:
         """Which features move, and the moving bodies."""
@@ -226,8 +226,8 @@ class Tracker:
         if standing.stands:  # a feature that does not stay is undecided, unless it moves
             leaving = np.setdiff1d(np.arange(len(features)), standing.witnesses)
             undecided = np.setdiff1d(np.union1d(labels.undecided, leaving), labels.moving)
-            labels = replace(labels, undecided=undecided)
-        return replace(step, labels=labels, objects=objects)
+            labels = changed(labels, undecided=undecided)
+        return changed(step, labels=labels, objects=objects)
 
     def manage(self, state: State, step: Step) -> Step:
         """Change the map, and remember the image patches of new landmarks."""
@@ -244,7 +244,7 @@ class Tracker:
         """
         rig_error, backend = self.rig_error, state.backend
         estimate, common = rig_error.added_to(backend, step.estimate), rig_error.common(backend, as_reported=False)
-        step = replace(step, estimate=estimate, common=common, correction=self.calibration.applied)
+        step = changed(step, estimate=estimate, common=common, correction=self.calibration.applied)
         return step, self.loop_closer.update(state.atlas, step)
 
     def roll_back(self, state: State) -> State:
@@ -260,7 +260,7 @@ def _shifted_as(corrected: StereoFeatures, before: StereoFeatures, now: StereoFe
     if corrected is before:
         return now
     left, right = now.uv_left - before.uv_left, now.uv_right - before.uv_right
-    return replace(corrected, uv_left=corrected.uv_left + left, uv_right=corrected.uv_right + right)
+    return changed(corrected, uv_left=corrected.uv_left + left, uv_right=corrected.uv_right + right)
 
 
 def frame_result(
@@ -281,7 +281,7 @@ def frame_result(
     estimate, common = atlas.estimate(step.estimate, step.common), common if atlas.anchor is None else CommonError()
     if atlas.anchor is None:  # the pose as reported has another error by the rig than in the present path
         covariance = estimate.covariance + common.covariance - step.common.covariance
-        estimate = replace(estimate, covariance=0.5 * (covariance + covariance.T))
+        estimate = changed(estimate, covariance=0.5 * (covariance + covariance.T))
     return FrameResult(
         step.index, status, reason, estimate, step.report, step.features,
         len(step.prediction.ids), step.matches.ids, step.matches.rows, step.added.ids, step.added.rows, step.erased,

@@ -170,16 +170,8 @@ def write_video(path: Path, images: list[np.ndarray], codec: str = "mp4v", rate:
 
 
 def write_opencv(path: Path, rig: StereoRig) -> None:
-    """Write a rig, as recorded, with the entries of ``cv2.stereoCalibrate`` [m]."""
-    left, right, R, b = rig.as_recorded
-    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
-    storage.write("image_width", left.width)
-    storage.write("image_height", left.height)
-    if rig.left.model == "equidistant":
-        storage.write("distortion_model", "equidistant")
-    for number, camera in enumerate((left, right), 1):
-        storage.write(f"K{number}", camera.K)
-        storage.write(f"D{number}", np.array([camera.distortion or (0.0,) * 4]))
-    storage.write("R", R)
-    storage.write("T", (R @ b).reshape(3, 1))
-    path.write_text(storage.releaseAndGetString())
+    """Write a rig with the entries of ``cv2.stereoCalibrate`` [m]."""
+    entries = {"image_width": rig.width, "image_height": rig.height, "R": rig.R, "T": (rig.R @ rig.b).reshape(3, 1)}
+    for number, camera in enumerate((rig.left, rig.right), 1):
+        entries |= {f"K{number}": camera.K, f"D{number}": np.array([camera.distortion or (0.0,) * 4])}
+    write_storage(path, entries)

@@ -9,6 +9,7 @@ import shlex
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -17,12 +18,11 @@ from experiments.parameters import find
 from experiments.sensitivity import name_of
 from frontends.surf import SurfConfig
 from slam import worlds
+from slam.errors import SlamError
 from slam.evaluation.metrics import absolute_errors
 from slam.geometry import se3
-from slam.geometry.camera import PinholeCamera
-from slam.geometry.rig import StereoRig
 from slam.settings import can_be_set
-from tests.recordings import write_opencv, write_storage, write_video
+from tests.recordings import write_storage, write_video
 from tests.scripts import load_script
 
 ROOT = Path(__file__).parent.parent
@@ -43,6 +43,28 @@ def test_the_shown_back_end_follows_the_camera():
     assert absolute_errors(system.trajectory(), sequence.ground_truth).rmse < 0.02  # measured 4 mm, on 25 cm of path
 
 
+def test_a_world_and_a_format_of_one_s_own_are_opened_by_module_and_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(DOCS / "examples")
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    world = slam.open_sequence("synthetic:hall:HALL?frames=3&high=4")
+    for name in "ab":
+        (tmp_path / name).mkdir()
+    c = world.rig.left
+    numbers = {"fx": c.fu, "fy": c.fv, "cx": c.u0, "cy": c.v0, "baseline": world.rig.baseline}
+    (tmp_path / "rig.yaml").write_text("".join(f"{name}: {value}\n" for name, value in numbers.items()))
+    for frame in world:
+        for name, image in (("a", frame.left), ("b", frame.right)):
+            cv2.imwrite(str(tmp_path / name / f"{frame.stamp + 1:.3f}.png"), image)
+    read = slam.open_sequence(tmp_path, "pairs_format:open_folder")
+    assert read.rig.baseline == world.rig.baseline and read.stamps == pytest.approx(world.stamps + 1, abs=1e-3)
+    for one, other in zip(world, read, strict=True):
+        np.testing.assert_array_equal(one.right, other.right)
+    with pytest.raises(SlamError, match=r"is no slam\.worlds\.scenes\.Scene"):
+        slam.open_sequence("synthetic:hall:build")
+    with pytest.raises(SlamError, match=r"format 'numpy:eye': TypeError"):
+        slam.open_sequence(tmp_path, "numpy:eye")
+
+
 @pytest.mark.slow
 def test_two_streams_of_arrays_are_followed(capsys):
     module = load_script("docs/examples/two_streams.py")
@@ -61,31 +83,14 @@ def test_a_pose_is_found_among_known_points():
     assert 45 < solution.cost < 130  # 90 measurements
 
 
-def raw_folder(folder):
-    """Images of cameras that are distorted and turned to each other; what they show does not matter."""
-    import cv2
-
-    turned = cv2.Rodrigues(np.array([0.01, -0.02, 0.005]))[0]
-    left, right = (
-        PinholeCamera(150.0, 151.0, 80.0, 60.0, 160, 120, "radtan", (-0.1, k, 0.0, 0.0)) for k in (0.01, 0.02)
-    )
-    for side in ("left", "right"):
-        (folder / side).mkdir(parents=True)
-        for k in range(3):
-            noise = np.random.default_rng(k).integers(0, 255, (120, 160), np.uint8)
-            cv2.imwrite(str(folder / side / f"{k:03d}.png"), noise)
-    write_opencv(folder / "calibration.yaml", StereoRig(left, right, turned, np.array([-0.1, 0.002, 0.001])))
-    return f"{folder}?fps=10"
-
-
 @pytest.mark.parametrize("name", ["walk", "walk.bag"])  # ROS 2, ROS 1
-@pytest.mark.parametrize("raw", [False, True])
-def test_a_bag_is_written_and_read_again(tmp_path, monkeypatch, raw, name):
-    source = str(raw_folder(tmp_path / "raw")) if raw else "synthetic:desk?frames=3"
+@pytest.mark.parametrize("rig", ["rectified", "toedin"])
+def test_a_bag_is_written_and_read_again(tmp_path, monkeypatch, rig, name):
+    source = f"synthetic:desk?frames=3&rig={rig}"
     monkeypatch.setattr(sys, "argv", ["write_bag.py", source, str(tmp_path / name)])
     runpy.run_path(str(DOCS / "examples" / "write_bag.py"))
     written, read = slam.open_sequence(source), slam.open_sequence(tmp_path / name)
-    assert read.rig.is_rectified != raw
+    assert read.rig.is_rectified == (rig == "rectified")
     assert read.rig.baseline == pytest.approx(written.rig.baseline)
     np.testing.assert_allclose(read.rig.left.distortion, written.rig.left.distortion)
     np.testing.assert_allclose(read.rig.R, written.rig.R, atol=1e-9)
@@ -166,7 +171,7 @@ def test_settings_exist(page):
 @each_page
 def test_worlds_and_scripts_exist(page):
     text = page.read_text(encoding="utf-8")
-    for name, query in re.findall(r"synthetic:([a-z]+)(?:\?([\w=&.:,]+))?", text):
+    for name, query in re.findall(r"synthetic:([a-z]+)(?!:)\b(?:\?([\w=&.:,]+))?", text):
         worlds.parse_query(name, "" if "key=" in query else query, worlds.options(name))
     for script in re.findall(r"\b(?:python|pytest)(?: -\S+)* ((?:experiments|benchmarks|docs|tests)/\S+?\.py)", text):
         assert (ROOT / script).is_file(), script

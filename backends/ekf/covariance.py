@@ -17,6 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg.blas import dsyr2k, dsyrk
 
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
@@ -25,6 +26,7 @@ CAMERA = 12  #: fixed: size of the camera's state [r, φ, v, ω]
 POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 RECENT = 4  #: cost: poses before the present one that are kept
 HEAD = CAMERA + POSE * RECENT  #: fixed: size of camera and last poses, behind which the landmarks stand
+_BLOCK = 64  # cost: rows that are mirrored at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,24 +170,16 @@ class Covariance:
             J: the camera's error becomes J (12, 12) times what it was,
             shift: and then to those of the state's landmarks this (A, 3, 6) times that of the pose is added.
         """
-        P, by_rig, b, shift = self.P.copy(), self.by_rig.copy(), self.begin, shift.reshape(-1, POSE)
-        P[:CAMERA] -= V[:CAMERA] @ V.T
-        P[CAMERA:b, b:] -= V[CAMERA:b] @ V[b:].T
-        by_rig[:CAMERA], by_rig[b:] = by_rig[:CAMERA] - V[:CAMERA] @ lost_by_rig, by_rig[b:] - V[b:] @ lost_by_rig
-        P[:CAMERA], by_rig[:CAMERA] = J @ P[:CAMERA], J @ by_rig[:CAMERA]
-        moved = P[:CAMERA, :CAMERA] @ J.T
-        own = positive(0.5 * (moved + moved.T), self.camera.diagonal(), V.shape[1])
-        by_shift = shift @ own[:POSE, :POSE]
-        along, gone = (P[:POSE, b:].T + 0.5 * by_shift) @ shift.T, V[b:] @ V[b:].T
-        along += along.T.copy()
-        gone -= along
-        P[b:, b:] -= gone
-        positive(P[b:, b:], self.P.diagonal()[b:] + (by_shift * shift).sum(axis=1), V.shape[1])
-        P[:CAMERA, :CAMERA] = own
-        P[CAMERA:b, :CAMERA] = P[:CAMERA, CAMERA:b].T
-        P[:b, b:] += P[:b, :POSE] @ shift.T
-        P[b:, :b], by_rig[b:] = P[:b, b:].T, by_rig[b:] + shift @ by_rig[:POSE]
-        return replace(self, P=P, by_rig=by_rig)
+        last, by_rig, K = slice(CAMERA, self.begin), self.by_rig - V @ lost_by_rig, np.zeros((len(self.P), CAMERA))
+        P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
+        P[:CAMERA, :CAMERA] = mirrored(P[:CAMERA, :CAMERA])
+        K[:CAMERA], K[self.begin :] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
+        half = 0.5 * K @ P[:CAMERA, :CAMERA]  # T = 1 + [K, 0]:  T P Tᵀ = P + K Yᵀ + Y Kᵀ,  Y = P[:, :12] + K P_cc / 2
+        P = dsyr2k(1.0, K, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
+        by_rig += K @ by_rig[:CAMERA]
+        P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]
+        summands = self.P.diagonal() + 2 * (half * K).sum(axis=1)
+        return replace(self, P=positive(mirrored(P), summands, V.shape[1]), by_rig=by_rig)
 
     def displaced(self, rows: IndexArray, change: Array, shift: Array) -> Covariance:
         """After a change (M, 3) of some landmarks' coordinates that is none of their error, with a shift as above.
@@ -196,6 +190,14 @@ class Covariance:
         by_rig[self.numbers(rows).ravel(), -1:] -= change.reshape(-1, 1)
         nothing = np.zeros((len(self.P), 0)), np.zeros((0, by_rig.shape[1]))
         return replace(self, by_rig=by_rig).corrected(*nothing, np.eye(CAMERA), shift)
+
+
+def mirrored(P: Array) -> Array:
+    """P (n, n) with its lower triangle also above the diagonal, in place."""
+    for i in range(0, len(P), _BLOCK):
+        own, below = P[i : i + _BLOCK, i : i + _BLOCK], P[i + _BLOCK :, i : i + _BLOCK]
+        own[:], P[i : i + _BLOCK, i + _BLOCK :] = np.tril(own) + np.tril(own, -1).T, below.T
+    return P
 
 
 def positive(P: Array, summands: Array, terms: int) -> Array:

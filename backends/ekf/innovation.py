@@ -159,10 +159,7 @@ class Linearisation:
         HP = self.times(P[numbers])
         S = self.times(HP[:, numbers].T)
         S[np.diag_indices(len(S))] += update.sigma**2
-        upper, info = dpotrf(S.T)  # of the transpose, which is in the order that LAPACK wants
-        if info != 0:
-            raise UnsolvableError("the innovation covariance is not positive definite")
-        return Innovation(self, HP, nu, S, upper_inverse(upper).T)
+        return Innovation(self, HP, nu, S)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,56 +170,47 @@ class Innovation:
     HP: Array  # H P (3M, n), with everything
     nu: Array  # innovation of the prior's mean (3M,)
     S: Array  # its covariance (3M, 3M)
-    inverse: Array  # L⁻¹ (3M, 3M), lower triangular, with ``S = L Lᵀ``
 
     def whitened(self, used: BoolArray) -> Whitened:
-        """That of some landmarks (mask (M,)), whitened.
-
-        Of ``L⁻¹ ν`` that part is taken which does not depend on the others' measurements: with A (3M, k) orthonormal,
-        spanned by their columns of L⁻¹, it is ``(1 − A Aᵀ) L⁻¹ ν``, whose square is the ``νᵀ S⁻¹ ν`` of these alone.
-        """
-        out = np.flatnonzero(np.repeat(~used, 3))
-        if not len(out):
-            return Whitened(self, used, self.inverse[:, out], self.inverse)
-        A = np.linalg.qr(self.inverse[:, out])[0]
-        root = self.inverse - A @ (A.T @ self.inverse)
-        root[:, out] = 0.0
-        return Whitened(self, used, A, root)
+        """That of some landmarks (mask (M,)), whitened. Raises UnsolvableError if S is not positive definite."""
+        rows = np.flatnonzero(np.repeat(used, 3))
+        upper, info = dpotrf(self.S[rows[:, None], rows].T)  # of the transpose, which is in the order that LAPACK wants
+        if info != 0:
+            raise UnsolvableError("the innovation covariance is not positive definite")
+        return Whitened(self, used, rows, upper_inverse(upper).T)
 
 
 @dataclass(frozen=True, eq=False)
 class Whitened:
-    """The innovation of some landmarks whitened: ``w = root ν`` has the covariance ``1 − A Aᵀ``, see above."""
+    """The innovation of K landmarks whitened: ``w = L⁻¹ ν``, with ``S = L Lᵀ`` of these alone."""
 
     innovation: Innovation
     used: BoolArray  # which landmarks (M,)
-    A: Array  # (3M, k)
-    root: Array  # (3M, 3M), with zero columns for the others; its square is their S⁻¹
+    rows: IndexArray  # their rows (3K,) of the innovation
+    inverse: Array  # L⁻¹ (3K, 3K), lower triangular
 
     @cached_property
     def w(self) -> Array:
-        """The whitened innovation (3M,); its square is the NIS ``νᵀ S⁻¹ ν``."""
-        return np.asarray(self.root @ self.innovation.nu)
+        """The whitened innovation (3K,); its square is the NIS ``νᵀ S⁻¹ ν``."""
+        return np.asarray(self.inverse @ self.innovation.nu[self.rows])
 
     @cached_property
     def y(self) -> Array:
-        """``S⁻¹ ν`` (3M,)."""
-        return np.asarray(self.w @ self.root)
+        """``S⁻¹ ν`` (3K,)."""
+        return np.asarray(self.w @ self.inverse)
 
     @cached_property
     def by_pose(self) -> Array:
-        """The whitened innovation's covariance (3M, 6) with the pose."""
-        return np.asarray(self.root @ self.innovation.HP[:, :POSE])
+        """The whitened innovation's covariance (3K, 6) with the pose."""
+        return np.asarray(self.inverse @ self.innovation.HP[self.rows, :POSE])
 
     def gain_root(self) -> tuple[Array, Array]:
-        """V (n, 3M) with ``V Vᵀ = K S Kᵀ``, and ``root`` times derivatives of ν by errors of the rig."""
+        """V (n, 3K) with ``V Vᵀ = K S Kᵀ``, and L⁻¹ times derivatives (3K, m) of ν by errors of the rig."""
         at, update = self.innovation.at, self.innovation.at.update
-        V = dtrmm(1.0, self.innovation.inverse.T, self.innovation.HP.T, side=1)
-        if self.A.size:
-            V -= (V @ self.A) @ self.A.T
+        V = dtrmm(1.0, self.inverse.T, self.innovation.HP[self.rows].T, side=1, overwrite_b=1)
         by_rig = at.times(update.covariance.by_rig[np.append(np.arange(POSE), update.numbers)])
         by_rig -= np.where(at.seen[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
-        return V, self.root @ by_rig
+        return V, self.inverse @ by_rig[self.rows]
 
     def distances(self) -> Array:
         """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any.
@@ -230,12 +218,10 @@ class Whitened:
         For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off
         by ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so that the distance is ``y_jᵀ Q_j⁻¹ y_j``.
         """
-        columns, Q = self.root.reshape(-1, len(self.used), 3), np.zeros((len(self.used), 3, 3))
-        for i in range(3):
-            for j in range(i + 1):
-                Q[:, i, j] = (columns[:, :, i] * columns[:, :, j]).sum(axis=0)
+        columns = self.inverse.reshape(len(self.inverse), len(self.inverse) // 3, 3).transpose(1, 2, 0)
+        Q = columns @ columns.transpose(0, 2, 1)
         found = np.zeros(len(self.used))
-        found[self.used] = squared_distances(self.y.reshape(-1, 3)[self.used], Q[self.used])  # of lower triangles
+        found[self.used] = squared_distances(self.y.reshape(-1, 3), Q)
         if not np.isfinite(found).all():
             raise UnsolvableError("the innovation covariance is not positive definite")
         return found

@@ -126,7 +126,7 @@ def _predicted(found: Posterior, gated: Gated) -> BoolArray:
     out = np.flatnonzero(~found.used & nu.at.seen.any(axis=1) & np.isfinite(gated.distances))
     if len(out):
         numbers = (3 * out[:, None] + np.arange(3)).ravel()
-        X = found.whitened.root @ nu.S[:, numbers]
+        X = found.whitened.inverse @ nu.S[found.whitened.rows[:, None], numbers]
         S = nu.S[numbers[:, None], numbers] - X.T @ X
         residuals = (nu.nu[numbers] - found.whitened.w @ X).reshape(-1, 3)
         agree[out] = squared_distances(residuals, _blocks(S)) <= gated.limits[out]
@@ -153,7 +153,7 @@ def _iterate(innovation: Innovation, used: BoolArray) -> Posterior:
             innovation = update.at(posterior.camera, posterior.change[CAMERA:]).innovation()
         used = used & innovation.at.seen.any(axis=1)
         whitened = innovation.whitened(used)
-        change = np.delete(whitened.y @ innovation.HP, np.s_[CAMERA : update.covariance.begin])
+        change = np.delete(whitened.y @ innovation.HP[whitened.rows], np.s_[CAMERA : update.covariance.begin])
         if not np.isfinite(change).all():
             raise UnsolvableError("the corrected state is not finite")
         posterior = Posterior(whitened, change)
@@ -173,6 +173,6 @@ def _linear(found: Posterior) -> bool:
     errors = np.where(now.seen & whitened.used[:, None], errors, 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
-    shift = (whitened.root @ errors.reshape(-1)) @ whitened.by_pose
+    shift = (whitened.inverse @ errors.reshape(-1)[whitened.rows]) @ whitened.by_pose
     variances = update.covariance.pose.diagonal() - (whitened.by_pose**2).sum(axis=0)
     return bool((shift**2 <= _POSE_SHARE**2 * variances).all())

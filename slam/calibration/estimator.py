@@ -12,7 +12,6 @@ of θ and of the baseline's length, and 1, whose column has the field ``−F_k c
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +28,7 @@ from slam.calibration.posterior import (
     RigPosterior,
     along,
     factory_prior,
+    mean_variance,
     prior_information,
     residual_likelihoods,
     resumed_prior,
@@ -39,6 +39,7 @@ from slam.calibration.posterior import (
 from slam.calibration.saved import SavedCalibration, joint_calibration
 from slam.data import CommonError, Estimate, StereoFeatures
 from slam.errors import ConfigurationError
+from slam.geometry.arrays import changed
 from slam.geometry.rig import StereoRig
 from slam.geometry.rig_numbers import rig_numbers
 from slam.geometry.se3 import Array, adjoint
@@ -88,7 +89,7 @@ class SelfCalibration:
         self._fields: Evidence | None = None  # of rows: parameters and residual fields
         self._far = self.model.field(self.model.far())[:, 2]  # disparities of far points by the parameters
         self._focal = along(self.model, *FOCALS) / 2  # the focal lengths' common error by the parameters
-        self._unknown = _mean_variance(self._far, np.linalg.inv(prior_information(self.model)))
+        self._unknown = mean_variance(self._far, np.linalg.inv(prior_information(self.model)))
         self._variances = np.log(np.square([config.pixel_sigma, config.disparity_sigma]))  # and of how many pairs
         self._scattered = 4  # 4: number of pairs that the configured noise counts for
         self._waiting: list[View] = []
@@ -133,7 +134,7 @@ class SelfCalibration:
         """
         if not self.config.enabled:
             return None
-        variance = _mean_variance(self._far, self._own.covariance)
+        variance = mean_variance(self._far, self._own.covariance)
         known = self._kept is not None or (variance <= 0.5 * self._unknown and self._motion_agrees())
         mean = self._own.mean if known else np.zeros_like(self._own.mean)
         step = mean - self.applied.parameters
@@ -280,11 +281,6 @@ class SelfCalibration:
         self._by_bias = gain * self._systematic @ gain.T + found.fields * effect @ effect.T
 
 
-def _mean_variance(changes: Array, covariance: Array) -> float:
-    """Mean variance of changes (N, n) by the parameters, with their covariance (n, n)."""
-    return float((changes @ covariance * changes).sum(axis=1).mean())
-
-
 class RemainingRigError:
     """The rig's error that is left in a back end's estimate while self-calibration continues.
 
@@ -296,11 +292,19 @@ class RemainingRigError:
         self._revised = np.zeros(len(calibration.model.names))  # changes of the correction that the whole path followed
         self._turned = np.zeros(6)  # how the world turned as the whole path was revised: a motion, on the left
         self._root: tuple[Array, Array] | None = None  # of the last covariance, which is asked for thrice in a frame
+        self._asked: tuple[Backend | None, bool] = None, False  # a back end, and whether it considers the rig's error
 
     def follow(self, backend: Backend, pose: Array | None = None) -> None:
         """Let a back end that can follow the errors, before its first frame; `pose` (6, m) is J of its first pose."""
-        if self._calibration.config.enabled and isinstance(backend, ConsideringBackend):
-            backend.consider(self.field, pose)
+        if (considering := self._considering(backend)) is not None:
+            considering.consider(self.field, pose)
+
+    def _considering(self, backend: Backend) -> ConsideringBackend | None:
+        """The back end, if it considers the rig's error; that takes long to find out."""
+        if backend is not self._asked[0]:
+            considers = self._calibration.config.enabled and isinstance(backend, ConsideringBackend)
+            self._asked = backend, considers
+        return backend if self._asked[1] else None  # type: ignore[return-value]
 
     def field(self, z: Array) -> Array:
         """Derivatives (N, 3, n + 2) of true rows (uL, vL, uR) by what is followed, at corrected rows (N, 3) [px]."""
@@ -327,7 +331,7 @@ class RemainingRigError:
         Where the back end has `restarted`, part of the path is an earlier one's and cannot be revised.
         """
         applied = self._calibration.applied
-        if not isinstance(backend, RevisingBackend) or applied is self._measured_with:
+        if applied is self._measured_with or not isinstance(backend, RevisingBackend):
             return None
         revision = Revision(self._measured_with, applied)
         whole = not restarted and backend.revises_path
@@ -342,11 +346,11 @@ class RemainingRigError:
 
     def added_to(self, backend: Backend, estimate: Estimate) -> Estimate:
         """The back end's estimate with the rig's uncertainty added."""
-        if not (self._calibration.config.enabled and isinstance(backend, ConsideringBackend)):
+        if (considering := self._considering(backend)) is None:
             return estimate
-        root, (J, L) = self._common_root(self._revised), backend.sensitivities(estimate.ids)
+        root, (J, L) = self._common_root(self._revised), considering.sensitivities(estimate.ids)
         J, L = J @ root, L @ root
-        return replace(
+        return changed(
             estimate, covariance=estimate.covariance + J @ J.T,
             covariances=estimate.covariances + L @ np.swapaxes(L, 1, 2),
         )  # fmt: skip
@@ -362,9 +366,9 @@ class RemainingRigError:
         as reported in each frame, with the correction of that time; else for the present path, in which a back end may
         have revised earlier poses.
         """
-        if not (self._calibration.config.enabled and isinstance(backend, ConsideringBackend)):
+        if (considering := self._considering(backend)) is None:
             return CommonError()
-        J, revised = _of_pose(backend), self._revised
+        J, revised = _of_pose(considering), self._revised
         if as_reported:
             J, revised = J.copy(), 0.0 * revised
             J[:, -1] -= J[:, :-2] @ self._revised

@@ -7,13 +7,14 @@ ideal rig would have measured.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from slam.calibration import kernels
 from slam.data import StereoFeatures
+from slam.geometry.arrays import changed
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 
@@ -124,7 +125,7 @@ class RigCorrection:
         points = self.model.points(np.column_stack([left, right[:, 0]]))
         change = self.model.shift(points, self.parameters)
         z, vertical = self.model.rows(points + change[:, :3]), right[:, 1] - left[:, 1] + change[:, 3]
-        return replace(features, uv_left=z[:, :2], uv_right=np.column_stack([z[:, 2], z[:, 1] + vertical]))
+        return changed(features, uv_left=z[:, :2], uv_right=np.column_stack([z[:, 2], z[:, 1] + vertical]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -276,6 +276,11 @@ def along(model: RigModel, *names: str) -> Array:
     return np.array([float(name in names) for name in model.names])
 
 
+def mean_variance(changes: Array, covariance: Array) -> float:
+    """Mean variance of changes (N, n) by the parameters, with their covariance (n, n)."""
+    return float((changes @ covariance * changes).sum(axis=1).mean())
+
+
 def systematic_variance(model: RigModel, error: float) -> Array:
     """Variances (n,) of the parameters due to a matching bias that all frames of a recording share.
 

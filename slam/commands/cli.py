@@ -54,7 +54,7 @@ _Backend = Annotated[str | None, option("Back end, see `slam list`; default: ekf
 _Frames = Annotated[str | None, option("Range of frames, B left out.", "A:B")]
 _Quiet = Annotated[bool, option("No progress, no table.", None, "--quiet", "-q")]
 _Picture = Annotated[bool, option("Leave a picture of the run.", None, "--picture/--no-picture")]
-_Format = Annotated[str | None, option("Format; default: found out from the folder.", "FORMAT")]
+_Format = Annotated[str | None, option("Format, or module:function; default: found out from the folder.", "FORMAT")]
 _Mask = Annotated[
     str | None, option("Image that is black where a camera sees its own car; left, right.", "FILE[,FILE]")
 ]
@@ -153,7 +153,7 @@ def run_command(
         folder = stack.enter_context(run_folder(out, opened.name, options.backend))
         options = replace(options, out=folder)
         written = [*options.outputs, *([drawing.output(draw)] if draw else []), *viewing.outputs(viewer, "--viewer")]
-        require_outputs(written, [*inputs, *options.inputs], overwrite)
+        require_outputs(written, inputs, overwrite)
         gathered = RunRecord()  # its time of compiling begins here
         tell = stack.enter_context(progress(*shown_as))
         if options.config.objects.mode != "off":

@@ -14,9 +14,11 @@ from typing import Any
 
 import typer
 
+from slam.calibration import load_calibration
 from slam.commands.display import print_summary
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError
+from slam.files import note_input
 from slam.outputs import Output
 from slam.run.options import RunOptions, parse_frames
 from slam.run.plots import leave_picture
@@ -47,6 +49,10 @@ def prepare(
     config = SystemConfig.for_kind(kind, options.frontend)
     require_settable(settings, config.to_json(), options.frontend)
     config = config.with_settings([*(["map.monocular=true"] if options.mono else []), *settings])
+    if options.calibration is not None:
+        load_calibration(options.calibration)  # what cannot be read is said before anything is written
+    if options.prior_map is not None:
+        note_input(options.prior_map)
     start, stop = parse_frames(frames)
     return opened, replace(options, config=config, start=start, stop=stop, kind=kind, command=command_line())
 

@@ -13,9 +13,10 @@ import numpy as np
 from slam.compare import tables
 from slam.compare.plan import Plan, is_world
 from slam.compare.statistics import LEVEL
-from slam.compare.sweep import SWEEP, Run
+from slam.compare.sweep import Run
 from slam.compare.tables import Group
-from slam.files import read_object, write_text
+from slam.files import write_text
+from slam.run.options import versions
 from slam.run.plots import backend_colours, drawn
 from slam.run.results import BY_KEY
 from slam.run.run_data import RunData
@@ -52,7 +53,7 @@ def write_report(
         sections=[(own, list(_pictures(own[0]))) for own in modes],
         times=[(group.name, *map(_time, group.runs.values())) for group in every],
         command=command,
-        versions=read_object(out / SWEEP)["versions"],
+        versions=versions(),
     )
     write_text(out / "report.html", text)
     return out / "report.html"

@@ -58,20 +58,18 @@ def sweep(
 
     Args:
         plan: what to run.
-        out: folder; one of an earlier sweep with the same versions is gone on with.
+        out: folder; what an earlier sweep has done in it with the same versions is taken over.
         workers: processes on this machine, of one thread each.
         on_done: called for each trial that ends, or was done before.
         overwrite: whether to run all again, and to replace files that are there.
 
     Raises:
-        SlamError: a sequence, name or setting is bad (nothing is run then), the folder holds something else, or a
-            worker process ended.
+        SlamError: a worker process ended. What is wrong with the plan or the folder, `check` says before.
     """
-    check(plan, out, overwrite, quiet=True)
     told = on_done or (lambda trial: None)
     with naming_folder(out):
         out.mkdir(parents=True, exist_ok=True)
-    write_json(out / SWEEP, {"trials": [asdict(trial) for trial in plan.every], "versions": versions()})
+    write_json(out / SWEEP, {"trials": [asdict(trial) for trial in plan.every]})
     for mode in plan.modes:  # a replay needs the closed loop
         jobs: list[Job] = []
         for trial in plan.trials_of(mode):
@@ -132,18 +130,18 @@ def _begin_worker() -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
 
 
-def check(plan: Plan, out: Path, overwrite: bool = False, quiet: bool = False) -> dict[str, int]:
+def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
     """Try every sequence, front end, back end and setting once, and whether the files can be written.
 
-    Returns the number of frames of a run, by sequence. What is wrong with a recording is logged unless `quiet`. Raises
-    SlamError where something cannot work.
+    Returns the number of frames of a run, by sequence. What is wrong with a recording is logged. Raises SlamError where
+    something cannot work.
     """
     frames: dict[str, int] = {}
     with noting_inputs() as inputs:
         for trial in plan.trials_of(CLOSED_LOOP):
             if trial.seed:
                 continue
-            sequence = open_sequence(trial.source, quiet=quiet or trial.sequence in frames)
+            sequence = open_sequence(trial.source, quiet=trial.sequence in frames)
             frames[trial.sequence] = len(range(len(sequence))[trial.start : trial.stop])
             config = config_of(trial, sequence)
             if plan.frontend != SIMULATED:
@@ -151,18 +149,10 @@ def check(plan: Plan, out: Path, overwrite: bool = False, quiet: bool = False) -
             inside = Rectification(sequence.rig)
             models = inside.models(config.models)
             registry.create("backends", trial.backend, inside.rig, models=models, **config.backend)
-    goes_on = not overwrite and (out / SWEEP).is_file()
-    if goes_on:
-        held = read_object(out / SWEEP)
-        before, trials = held.get("versions"), held.get("trials")
-        if not isinstance(before, dict) or not isinstance(trials, list):
-            raise SlamError(f"{out / SWEEP}: not that of a comparison")
-        for name, now in versions().items():
-            if (then := before.get(name, "unknown")) != now:
-                raise SlamError(f"{out}: begun with {name} {then}, not {now}; give another --out")
-        if not set(map(json.dumps, trials)) <= {json.dumps(asdict(trial)) for trial in plan.every}:
-            raise SlamError(f"{out}: holds a comparison of more or other runs; give another --out, or --overwrite")
-    require_outputs([Output(out, "--out", NAMES)], inputs, overwrite or goes_on)
+    held = read_object(out / SWEEP).get("trials") if (out / SWEEP).is_file() and not overwrite else None
+    if isinstance(held, list) and not set(map(json.dumps, held)) <= {json.dumps(asdict(trial)) for trial in plan.every}:
+        raise SlamError(f"{out}: holds a comparison of more or other runs; give another --out, or --overwrite")
+    require_outputs([Output(out, "--out", NAMES)], inputs, overwrite or isinstance(held, list))
     return frames
 
 
@@ -180,10 +170,10 @@ def read_run(trial: Trial, out: Path) -> Run:
 
 
 def is_done(trial: Trial, out: Path) -> bool:
-    """Whether the trial has ended before, with these settings and frames, which its folder's name does not tell."""
+    """Whether the trial has ended before, with these settings, frames and versions, which no folder's name tells."""
     try:
         read_run(trial, out)
-        before = read_object(out / RUNS / trial.folder / RESULT).get("trial")
+        before = read_object(out / RUNS / trial.folder / RESULT)
     except SlamError:
         return False
-    return bool(before == json.loads(json.dumps(asdict(trial))))
+    return bool(before.get("versions") == versions() and before.get("trial") == json.loads(json.dumps(asdict(trial))))

@@ -18,7 +18,7 @@ from slam.evaluation.summary import with_truth
 from slam.files import remove_file
 from slam.geometry.se3 import Array, nearest_rotation
 from slam.geometry.stamps import frame_range, pair
-from slam.run.options import RunOptions
+from slam.run.options import RunOptions, versions
 from slam.run.outputs import naming_folder, write_json
 from slam.run.recording import load_recording
 from slam.run.results import figures
@@ -65,8 +65,8 @@ def keep_result(
     found = {"completed": float(outcome == COMPLETED), **known}
     with naming_folder(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    result = {"trial": asdict(trial), "outcome": outcome, "metrics": found, "milliseconds": milliseconds or {}}
-    write_json(folder / RESULT, result)
+    result = {"trial": asdict(trial), "versions": versions(), "outcome": outcome, "metrics": found}
+    write_json(folder / RESULT, result | {"milliseconds": milliseconds or {}})
 
 
 def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:

@@ -17,7 +17,7 @@ import numpy as np
 from slam.chi_square import chi_square_limit
 from slam.errors import TrajectoryError
 from slam.geometry.se3 import Array, inverse, log, pose, rotation_angle, so3_exp, so3_log
-from slam.geometry.trajectory import Trajectory, align
+from slam.geometry.trajectory import Trajectory, alignment
 
 #: Lengths of KITTI's segments [m].
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
@@ -96,9 +96,9 @@ def absolute_errors(estimate: Trajectory, truth: Trajectory) -> PathErrors:
         TrajectoryError: the lengths differ, or there is no pose.
     """
     _require_pairs(estimate, truth, 1)
-    estimate = align(estimate, truth).apply_trajectory(estimate)
-    distance = np.linalg.norm(estimate.positions - truth.positions, axis=1)
-    turn = np.swapaxes(truth.poses[:, :3, :3], 1, 2) @ estimate.poses[:, :3, :3]
+    poses = alignment(estimate, truth) @ estimate.poses
+    distance = np.linalg.norm(poses[:, :3, 3] - truth.positions, axis=1)
+    turn = np.swapaxes(truth.poses[:, :3, :3], 1, 2) @ poses[:, :3, :3]
     return PathErrors(distance, np.degrees(rotation_angle(turn)))
 
 

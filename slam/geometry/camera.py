@@ -210,6 +210,7 @@ def baseline_doubt(baseline: float) -> str:
 #: ones scatter by about 0.04, and those of a rectified pair are two numbers, not four.
 _OFF, _OFF_ALIKE = 0.3, 0.1
 _OBLONG = 0.1  # guard: largest difference of the focal lengths along rows and columns, as a share: pixels are square
+_NOT_SQUARE = 0.03  # guard: the same that digital cameras do not have; analog video has 0.07 to 0.09
 
 
 def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
@@ -239,6 +240,18 @@ def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
                 )
             return said + "were they cropped or turned, or is the calibration for others, or cx and cy exchanged?"
     return ""
+
+
+def oblong(*cameras: PinholeCamera) -> str:
+    """What to ask of cameras whose pixels are not square, as few are; empty where they are."""
+    shares = [camera.fu / camera.fv - 1 for camera in cameras]
+    share = min(shares, key=abs)  # where one alone is odd, rows disagree, which says more
+    if abs(share) <= _NOT_SQUARE:
+        return ""
+    return (
+        f"by the calibration the focal lengths along rows and columns differ by {100 * abs(share):.0f} %: pixels of "
+        "digital cameras are square; is one mistyped, or were images scaled in one way?"
+    )
 
 
 def floats(what: str, values: ArrayLike | None) -> Array:

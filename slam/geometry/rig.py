@@ -10,10 +10,16 @@ from numpy.typing import ArrayLike
 
 from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera, floats, size_doubt
-from slam.geometry.se3 import Array, is_rotation, nearest_rotation
+from slam.geometry.se3 import Array, is_rotation, nearest_rotation, pose
 
 _ZERO_DISPARITY = 1024  # fixed: OpenCV's CALIB_ZERO_DISPARITY, whose module differs between its versions
 MINIMAL_POINTS = 3  #: fixed: points that fix a pose
+
+#: What is said of cameras above each other, where their images are not at hand.
+NOT_SIDE_BY_SIDE = (
+    "the cameras do not stand side by side: the baseline is not along image rows. Of cameras above each other turn "
+    "both images by 90 degrees; recordings with such a calibration are turned when they are read"
+)
 
 
 def measurement_rows(uv_left: Array, uv_right: Array) -> Array:
@@ -70,11 +76,8 @@ class StereoRig:
         if baseline < 1e-6:
             raise CalibrationError("stereo baseline is zero: depth cannot be measured")
         if abs(b[0]) < 0.5 * baseline:
-            raise CalibrationError(
-                "the cameras do not stand side by side: the baseline is not along image rows. Of cameras above each "
-                "other turn both images by 90 degrees; recordings with such a calibration are turned when they are read"
-            )
-        if -b[0] < 0:
+            raise CalibrationError(NOT_SIDE_BY_SIDE)
+        if b[0] > 0:
             raise CalibrationError(
                 f"the right camera stands {b[0]:.4f} m to the left of the left one: "
                 "are the cameras swapped, or is the sign of T (or of P2) wrong? T is about (-baseline, 0, 0)"
@@ -106,13 +109,6 @@ class StereoRig:
         turns = 1 if b[1] < 0 else -1  # the second camera stands below the first, or above it
         Q = quarter_turn(turns)
         return cls(left.turned(turns), right.turned(turns), Q @ R @ Q.T, Q @ b, turns)
-
-    @property
-    def as_recorded(self) -> tuple[PinholeCamera, PinholeCamera, Array, Array]:
-        """Cameras, rotation and b of the images before they were turned: the inverse of `side_by_side`."""
-        Q = quarter_turn(-self.turns)
-        left, right = self.left.turned(-self.turns), self.right.turned(-self.turns)
-        return left, right, Q @ self.R @ Q.T, Q @ self.b
 
     @classmethod
     def from_pinhole(
@@ -180,10 +176,7 @@ class StereoRig:
     @cached_property
     def T_right_left(self) -> Array:
         """Pose (4, 4) taking left-camera to right-camera coordinates."""
-        T = np.eye(4)
-        T[:3, :3] = self.R
-        T[:3, 3] = self.R @ self.b
-        return T
+        return pose(self.R, self.R @ self.b)
 
     def __repr__(self) -> str:
         kind = "rectified" if self.is_rectified else "not rectified"
@@ -299,9 +292,7 @@ class RectifiedRig:
     @cached_property
     def T_left_rectified(self) -> Array:
         """Pose (4, 4) of the rectified left camera in the original left camera: a pure rotation."""
-        T = np.eye(4)
-        T[:3, :3] = self.R_left.T
-        return T
+        return pose(self.R_left.T, np.zeros(3))
 
     @cached_property
     def scale(self) -> float:

@@ -135,12 +135,12 @@ class Trajectory:
         return cls._of_file(path, rows[:, 0], pose(_rotations(path, rows[:, 4:8]), rows[:, 1:4]))
 
     @classmethod
-    def read_kitti(cls, path: str | Path, stamps: Array | None = None) -> Trajectory:
-        """Read rows of twelve numbers; `stamps` (N,) [s] default to the row numbers."""
+    def read_kitti(cls, path: str | Path) -> Trajectory:
+        """Read rows of twelve numbers; stamps are the row numbers."""
         rows = _read_table(path, None, 12)
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         poses[:, :3] = rows[:, :12].reshape(-1, 3, 4)
-        return cls._of_file(path, np.arange(len(rows), dtype=float) if stamps is None else stamps[: len(rows)], poses)
+        return cls._of_file(path, np.arange(len(rows), dtype=float), poses)
 
     @classmethod
     def read_euroc(cls, path: str | Path) -> Trajectory:
@@ -221,73 +221,33 @@ class TruthNoise:
 
 
 _STILL = 1e-12  # numerics: [m²] product of the two spreads: less than a micrometre each is no motion
+_LINE = 1e-12  # numerics: second singular value by the first, below which positions lie on a line
 
 
-@dataclass(frozen=True, eq=False)
-class Alignment:
-    """A motion ``target ≈ R source + t``.
+def alignment(estimate: Trajectory, truth: Trajectory) -> Array:
+    """The motion (4, 4) that takes an estimated path's positions nearest to the true ones, row by row (Umeyama 1991).
 
-    Attributes:
-        R: proper rotation (D, D).
-        t: translation (D,) [m].
-    """
-
-    R: Array
-    t: Array
-
-    def apply(self, positions: Array) -> Array:
-        """Aligned positions (N, D)."""
-        return np.asarray(positions @ self.R.T + self.t, np.float64)
-
-    def apply_trajectory(self, trajectory: Trajectory) -> Trajectory:
-        """The aligned trajectory."""
-        poses = trajectory.poses.copy()
-        poses[:, :3, :3] = self.R @ poses[:, :3, :3]
-        poses[:, :3, 3] = self.apply(trajectory.positions)
-        return Trajectory(trajectory.stamps, poses)
-
-
-def align_positions(source: Array, target: Array, orientations: Array | None = None) -> Alignment:
-    """The motion that takes positions `source` (N, D) nearest to `target` (N, D), D = 2 or 3 (Umeyama 1991).
-
-    Where the positions leave a turn open (fewer than three, on one line, standing still), `orientations` (N, 3, 3)
-    decide it: the products ``R_target R_sourceᵀ``, whose mean the rotation is brought nearest to. Without them it is
-    the turn nearest to none. The result is a proper rotation in every case, and depends on nothing but the input.
+    The scale stays. Where positions leave a turn open (fewer than three, on one line, standing still), orientations
+    decide it: the mean of ``R_true R_estimateᵀ``, to which the rotation is brought nearest.
 
     Raises:
-        TrajectoryError: shapes differ, there is no position, or one is not finite or impossibly large.
+        TrajectoryError: the lengths differ, there is no pose, or a position is impossibly large.
     """
-    source, target = np.asarray(source, float), np.asarray(target, float)
-    if source.shape != target.shape or source.ndim != 2 or not len(source):
-        raise TrajectoryError(f"alignment: positions {source.shape} and {target.shape} do not go together")
-    if not np.abs([source, target]).max() <= 1e100:  # 1e100: position [m] whose square is a number
-        raise TrajectoryError("alignment: a position is not finite, or impossibly large")
-    centre_s, centre_t = source.mean(axis=0), target.mean(axis=0)
-    s, t, dimensions = source - centre_s, target - centre_t, source.shape[1]
-    guide = np.eye(dimensions) if orientations is None else orientations.mean(axis=0)
-    U, d, Vt = np.linalg.svd(t.T @ s / len(s))
-    signs = np.ones(dimensions)  # the weakest direction is turned round where U Vᵀ is a mirror
-    signs[-1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    if len(estimate) != len(truth) or not len(truth):
+        raise TrajectoryError(f"alignment: {len(estimate)} estimated poses, {len(truth)} true ones")
+    if np.abs([estimate.positions, truth.positions]).max() > 1e100:  # 1e100: position [m] whose square is a number
+        raise TrajectoryError("alignment: a position is impossibly large")
+    centre, true_centre = estimate.positions.mean(axis=0), truth.positions.mean(axis=0)
+    s, t = estimate.positions - centre, truth.positions - true_centre
+    guide = (truth.poses[:, :3, :3] @ np.swapaxes(estimate.poses[:, :3, :3], 1, 2)).mean(axis=0)
+    M = t.T @ s / len(s)
+    U, d, _ = np.linalg.svd(M)
     if np.sqrt((s**2).mean() * (t**2).mean()) < _STILL or d[0] < _STILL:
         R = nearest_rotation(guide)
     else:
-        R = U @ np.diag(signs) @ Vt
-        # 1e-12: second singular value by the first, below which positions lie on a line
-        if d[1] <= 1e-12 * d[0] and dimensions == 3:
-            R = _turn_about(U[:, 0], R, guide)
-    return Alignment(R, centre_t - R @ centre_s)
-
-
-def align(estimate: Trajectory, truth: Trajectory) -> Alignment:
-    """The alignment of an estimated path with the true one, row by row; orientations decide what is left open.
-
-    Raises:
-        TrajectoryError: the lengths differ, or there is no pose.
-    """
-    if len(estimate) != len(truth):
-        raise TrajectoryError(f"alignment: {len(estimate)} estimated poses, {len(truth)} true ones")
-    orientations = truth.poses[:, :3, :3] @ np.swapaxes(estimate.poses[:, :3, :3], 1, 2)
-    return align_positions(estimate.positions, truth.positions, orientations)
+        R = nearest_rotation(M)
+        R = _turn_about(U[:, 0], R, guide) if d[1] <= _LINE * d[0] else R
+    return pose(R, true_centre - R @ centre)
 
 
 def _turn_about(axis: Array, R: Array, guide: Array) -> Array:

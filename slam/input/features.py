@@ -11,7 +11,7 @@ import numpy as np
 from slam.checks import LATEST_STAMP, unit_doubt
 from slam.data import BoolArray, Estimate, FrameResult, ImagePair, Observations, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError
-from slam.geometry.arrays import median
+from slam.geometry.arrays import changed, median
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse
 from slam.geometry.trajectory import Trajectory
@@ -57,7 +57,7 @@ def documented(features: Any, rig: StereoRig) -> StereoFeatures:
             f"features: descriptors must be unit vectors; the median of their lengths is {length:.3g}"
         )
     _require_images(features.images, rig)
-    return replace(features, stamp=stamp, threshold=threshold, **columns)
+    return changed(features, stamp=stamp, threshold=threshold, **columns)
 
 
 def outside_masks(features: StereoFeatures, frame: StereoFrame, rig: StereoRig) -> StereoFeatures:
@@ -68,7 +68,7 @@ def outside_masks(features: StereoFeatures, frame: StereoFrame, rig: StereoRig) 
     if frame.right_mask is not None:
         uv = rig.rectified.unrectify_right(features.uv_right) if features.rectified else features.uv_right
         visible = _at(frame.right_mask, uv)[:, None]
-        features = replace(features, uv_right=np.where(visible, features.uv_right, np.nan))
+        features = changed(features, uv_right=np.where(visible, features.uv_right, np.nan))
     return features
 
 
@@ -95,7 +95,7 @@ def following(features: StereoFeatures, dimensions: int | None, after: float) ->
         return features
     if len(features):
         raise MeasurementError(f"features: descriptors have {length} numbers, those of earlier frames {dimensions}")
-    return replace(features, descriptors=np.zeros((0, dimensions), np.float32))
+    return changed(features, descriptors=np.zeros((0, dimensions), np.float32))
 
 
 def _number(name: str, value: Any) -> float:
@@ -168,7 +168,7 @@ class Rectification:
         if self._none or features.rectified:
             return features
         left = self._ways.rectify_left(features.uv_left)
-        moved = replace(features, uv_left=left, uv_right=self._right(features.uv_right))
+        moved = changed(features, uv_left=left, uv_right=self._right(features.uv_right))
         inside = self.rig.left.in_image(left)
         return moved if inside.all() else moved.select(np.flatnonzero(inside))
 
@@ -193,11 +193,11 @@ class Rectification:
             return result
         f, common = result.features, result.common
         left, right = self._ways.unrectify_left(f.uv_left), self._ways.unrectify_right(f.uv_right)
-        return replace(
+        return changed(
             result,
             estimate=self.estimate_out(result.estimate),
-            features=replace(f, uv_left=left, uv_right=right, rectified=False),
-            common=replace(common, jacobian=self._adjoint @ common.jacobian),
+            features=changed(f, uv_left=left, uv_right=right, rectified=False),
+            common=changed(common, jacobian=self._adjoint @ common.jacobian),
         )
 
     def estimate_out(self, estimate: Estimate) -> Estimate:
@@ -205,7 +205,7 @@ class Rectification:
         if self._none:
             return estimate
         P = self._adjoint @ estimate.covariance @ self._adjoint.T
-        return replace(estimate, T_world_left=estimate.T_world_left @ self._back, covariance=P)
+        return changed(estimate, T_world_left=estimate.T_world_left @ self._back, covariance=P)
 
     def path_out(self, path: Trajectory) -> Trajectory:
         """A path of the rig's own left camera."""

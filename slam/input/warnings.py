@@ -10,7 +10,7 @@ import numpy as np
 
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import CalibrationError, SequenceError
-from slam.geometry.camera import baseline_doubt, size_doubt
+from slam.geometry.camera import baseline_doubt, oblong, size_doubt
 from slam.geometry.rig import StereoRig
 from slam.grey_range import eight_bits, grey_range
 from slam.input.grain import grain_doubt
@@ -59,6 +59,8 @@ class InputWarnings:
         for unlikely in filter(None, (baseline_doubt(rig.baseline), size_doubt(rig.left, rig.right))):
             self._warn(unlikely, no_path=True)
             self._pair_warned = self._partners_explained = True  # and what follows from it is not
+        if not self.lines and (odd := oblong(rig.left, rig.right)):
+            self._warn(odd)
 
     def look(self, frame: StereoFrame, features: StereoFeatures) -> None:
         """Check a frame and the features found in it, which are as documented.

@@ -22,7 +22,7 @@ from slam.errors import ConfigurationError
 from slam.files import array, read_bytes, unpack, whole_file
 from slam.geometry.arrays import isin
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, angles, inverse, log, pose, transform
+from slam.geometry.se3 import Array, inverse, log, pose, transform
 from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
@@ -34,6 +34,7 @@ _LARGEST = 2**28  # bytes of a database's file
 _FARTHEST = 1e8  # guard: of its numbers
 _STEP = 1e-5  # numerics: of the finite differences [m]
 _CANDIDATES = 12  # cost: features with the largest determinants among which a triple is looked for
+_LEAST_SIDE, _LEAST_SINE = 0.08, 0.3  # between two points of a triple [m], and of its angles
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +105,6 @@ class ObjectMotion:
 
     reason: str  # empty, or one line that says why there is no motion
     R: Array  # ``R_2^1`` (3, 3) (step d)
-    rpy: Array  # roll, pitch, yaw (3,) [rad] of R by the printed formulas
     translation: Array  # ``AA′`` (3,) [m] (step e)
     triple: NDArray[np.intp]  # rows of the three features in the current scene (3,)
     database: NDArray[np.intp]  # and in the database (3,)
@@ -112,8 +112,8 @@ class ObjectMotion:
     @classmethod
     def refused(cls, reason: str) -> ObjectMotion:
         """No motion."""
-        none = np.full(3, np.nan)
-        return cls(reason, np.full((3, 3), np.nan), none, none, np.zeros(0, np.intp), np.zeros(0, np.intp))
+        none = np.zeros(0, np.intp)
+        return cls(reason, np.full((3, 3), np.nan), np.full(3, np.nan), none, none)
 
 
 def body_frame(A: Array, B: Array, C: Array) -> Array:
@@ -127,21 +127,16 @@ def body_frame(A: Array, B: Array, C: Array) -> Array:
     return np.column_stack([v / np.linalg.norm(v) for v in (x, y, z)])
 
 
-def why_degenerate(points: Array, least_side: float, least_sine: float) -> str:
-    """Why points A, B, C (3, 3) [m] make no frame: one line, or empty where they do.
-
-    Two of them are at least `least_side` [m] apart, and every angle has a sine of at least `least_sine`.
-    """
+def why_degenerate(points: Array) -> str:
+    """Why points A, B, C (3, 3) [m] make no frame: one line, or empty where they do."""
     if not np.isfinite(points).all():
         return "a point has no depth"
     sides = points[[1, 2, 2]] - points[[0, 0, 1]]
     lengths = np.linalg.norm(sides, axis=1)
-    if lengths.min() < 1e-9 + 0.1 * least_side:
-        return "two of the three points are nearly the same"
-    if lengths.min() < least_side:
-        return f"two of the three points are {1e3 * lengths.min():.0f} mm apart, {1e3 * least_side:.0f} mm are needed"
+    if lengths.min() < _LEAST_SIDE:
+        return f"two of the three points are {1e3 * lengths.min():.0f} mm apart, {1e3 * _LEAST_SIDE:.0f} mm are needed"
     area = np.linalg.norm(np.cross(sides[0], sides[1]))
-    if area / np.sort(lengths)[1:].prod() < least_sine:
+    if area / np.sort(lengths)[1:].prod() < _LEAST_SINE:
         return "the three points are nearly collinear"
     return ""
 
@@ -154,7 +149,7 @@ def motion_of_triples(current: Array, initial: Array, origin: Array) -> tuple[Ar
 
 def detect(
     features: StereoFeatures, matches: tuple[NDArray[np.intp], NDArray[np.intp]], points: Array,
-    database: ObjectDatabase, least_side: float = 0.08, least_sine: float = 0.3,
+    database: ObjectDatabase,
 ) -> ObjectMotion:  # fmt: skip
     """The object's motion by Procedure 1, from `matches` of the database's rows and the features' (K,) (step c).
 
@@ -169,10 +164,10 @@ def detect(
     for triple in sorted(combinations(range(len(order)), 3), key=lambda three: three[::-1]):  # by their weakest feature
         three = order[list(triple)]
         current, initial = points[three], database.points[known[three]]
-        why = why_degenerate(current, least_side, least_sine) or why_degenerate(initial, least_side, least_sine)
+        why = why_degenerate(current) or why_degenerate(initial)
         if not why:
             R, AA = motion_of_triples(current, initial, database.origin)
-            return ObjectMotion("", R, angles(R), AA, rows[three], known[three])
+            return ObjectMotion("", R, AA, rows[three], known[three])
         reason = reason or why
     return ObjectMotion.refused(reason)
 
@@ -199,21 +194,13 @@ def _placed(current: Array, initial: Array, origin: Array) -> Array:
 class Procedure1Detector(ObjectDetector):
     """The papers' detector in the system's place for one; the object is number 1.
 
-    Its body frame lies in the database's origin, along the world's axes in the initial scene. Without a `database` the
-    file that the settings name is read.
+    Its body frame lies in the database's origin, along the world's axes in the initial scene.
     """
 
-    def __init__(
-        self, rig: StereoRig, config: ObjectsConfig, models: EstimatorModels, database: ObjectDatabase | None = None
-    ) -> None:
-        self.rig = rig
-        self.config = config
-        self.sigma = models.pixel_sigma
-        self.database = database if database is not None else ObjectDatabase.load(Path(config.database))
-        self.motion = ObjectMotion.refused("no frame yet")
-        self._rows = np.zeros(0, np.intp)
-        self._covariance: Array = np.eye(6)
-        self._last: tuple[float, Array] | None = None
+    def __init__(self, rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> None:
+        self._rig, self._sigma = rig, models.pixel_sigma
+        self._database = ObjectDatabase.load(Path(config.database))
+        self._last: tuple[float, Array] | None = None  # stamp [s] and pose
 
     def restart(self) -> None:
         """The database goes on; the last pose does not."""
@@ -226,7 +213,7 @@ class Procedure1Detector(ObjectDetector):
 
         The object is reported where it was measured in this frame; the back end is not asked.
         """
-        d = self.database
+        d = self._database
         if d.descriptors.shape[1] != features.descriptors.shape[1]:
             raise ConfigurationError(
                 f"objects: the database has descriptors of {d.descriptors.shape[1]} dimensions, the front end's have "
@@ -235,37 +222,29 @@ class Procedure1Detector(ObjectDetector):
         free = np.flatnonzero(features.has_stereo)
         found = match_everywhere(d.descriptors, d.laplacian, features.select(free), *_ALIKE)
         known, rows = found.tracks, free[found.features]
-        local = self.rig.triangulate(features.uv_left[rows], features.uv_right[rows])
+        local = self._rig.triangulate(features.uv_left[rows], features.uv_right[rows])
         points = transform(estimate.T_world_left, local)
-        self.motion = detect(features, (known, rows), points, d)
-        self._rows = rows
-        if not self.motion.reason:
-            at = np.array([np.flatnonzero(rows == row)[0] for row in self.motion.triple])
-            R = estimate.T_world_left[:3, :3]
-            noise = R @ self.rig.triangulation_covariance(local[at], self.sigma) @ R.T
-            self._covariance = motion_covariance(points[at], d.points[self.motion.database], d.origin, noise)
+        motion = detect(features, (known, rows), points, d)
         moved = np.sort(tracks.ids[(tracks.ids >= 0) & isin(tracks.row, rows)])
-        return MotionLabels(np.sort(rows), np.zeros(0, np.intp), moved), self._reported(features)
+        labels = MotionLabels(np.sort(rows), np.zeros(0, np.intp), moved)
+        if motion.reason:
+            return labels, ()
+        at = np.array([np.flatnonzero(rows == row)[0] for row in motion.triple])
+        R = estimate.T_world_left[:3, :3]
+        noise = R @ self._rig.triangulation_covariance(local[at], self._sigma) @ R.T
+        P = motion_covariance(points[at], d.points[motion.database], d.origin, noise)
+        T = pose(motion.R, d.origin + motion.translation)
+        return labels, (self._reported(labels.moving, features.stamp, T, P),)
 
-    def _reported(self, features: StereoFeatures) -> tuple[MovingObject, ...]:
-        if self.motion.reason:
-            return ()
-        d = self.database
-        found = pose(np.eye(3), d.origin)
-        T = pose(self.motion.R, d.origin + self.motion.translation)
-        before = self._last or (features.stamp, T)
-        step = T @ inverse(before[1])
-        dt = features.stamp - before[0]
-        velocity = np.zeros(6) if dt <= 0 else np.concatenate([log(step)[:3], T[:3, 3] - before[1][:3, 3]]) / dt
-        self._last = features.stamp, T
-        none = np.zeros(0, np.int64)
-        estimate = ObjectEstimate(
-            1, features.stamp, T, self._covariance, velocity, np.full((6, 6), np.nan), True, none, none
-        )  # fmt: skip
-        local = d.points - d.origin
+    def _reported(self, rows: NDArray[np.intp], stamp: float, T: Array, P: Array) -> MovingObject:
+        """The object at its pose T (4, 4), with its covariance P (6, 6)."""
+        last, before = self._last or (stamp, T)
+        step, dt = T @ inverse(before), stamp - last
+        velocity = np.zeros(6) if dt <= 0 else np.concatenate([log(step)[:3], T[:3, 3] - before[:3, 3]]) / dt
+        self._last = stamp, T
+        none, origin = np.zeros(0, np.int64), self._database.origin
+        estimate = ObjectEstimate(1, stamp, T, P, velocity, np.full((6, 6), np.nan), True, none, none)
+        local = self._database.points - origin
         extent = np.stack([local.min(axis=0), local.max(axis=0)])
-        return (
-            MovingObject(
-                1, np.sort(self._rows), estimate, step, T @ inverse(found), extent, True, measured_at=features.stamp
-            ),
-        )
+        since_found = T @ inverse(pose(np.eye(3), origin))
+        return MovingObject(1, rows, estimate, step, since_found, extent, True, measured_at=stamp)

@@ -8,10 +8,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from slam.calibration import load_calibration
 from slam.config import SystemConfig
 from slam.errors import SlamError
-from slam.files import noting_inputs
 from slam.outputs import Output
 from slam.run.outputs import NAMES
 
@@ -37,14 +35,6 @@ class RunOptions:
     live: bool = False  # take frames at their own rate, and leave out those that come too late; of a camera always
     kind: str = ""  # of motion that the settings are for; empty where not known
     command: str = ""  # the command line, for ``config.json``
-
-    @property
-    def inputs(self) -> list[Path]:
-        """Files that the run reads besides its sequence; raises SlamError where the calibration cannot be read."""
-        with noting_inputs() as found:
-            if self.calibration is not None:
-                load_calibration(self.calibration)
-        return found if self.prior_map is None else [*found, self.prior_map]
 
     @property
     def outputs(self) -> list[Output]:

@@ -12,7 +12,7 @@ path is known, ``truth_stamps`` and ``truth_poses``. Meanings: `Recording`.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -162,7 +162,7 @@ class RecordedFrame:
 
     @classmethod
     def of(cls, result: FrameResult, number: int | None = None) -> RecordedFrame:
-        """From what a step of the system did; `number` defaults to the step's."""
+        """From what a step of the system did; `number` defaults to the step's, counted from its first."""
         f, seen, new = result.features, result.matched_features, result.added_features
         return cls(
             result.index if number is None else number,
@@ -239,22 +239,3 @@ def _require_fits(frame: RecordedFrame, known: set[int]) -> set[int]:
         if wrong:
             raise MeasurementError(f"frame {frame.number}: landmark {min(wrong)} {words}")
     return (known | new) - gone
-
-
-def record(
-    results: Iterable[FrameResult],
-    rig: StereoRig,
-    models: EstimatorModels,
-    name: str = "",
-    ground_truth: Trajectory | None = None,
-) -> Recording:
-    """What the back end was given in a run.
-
-    Args:
-        results: of all steps, from the first one on.
-        rig: the cameras.
-        models: noise, priors and motion that the run assumed.
-        name: of the sequence.
-        ground_truth: the left camera's true path, where it is known.
-    """
-    return Recording(name, rig, models, tuple(map(RecordedFrame.of, results)), ground_truth)

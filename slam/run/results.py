@@ -239,11 +239,11 @@ def verdict_of_run(summary: Mapping[str, Any]) -> str:
         )
     if not text:
         why = (
-            "the true path is doubtful, as where it was interpolated over a gap"
-            if doubtful
+            "they are singular" if honest.get("singular covariances")
+            else "the true path is doubtful, as where it was interpolated over a gap" if doubtful
             else "they leave none for the motion between two poses, as where a back end claims the same one for every "
             "frame"
-        )
+        )  # fmt: skip
         return f"covariances cannot be judged: {why}"
     judged = next(iter(_ratios(figures(summary))))
     exact = honest.get(f"{BY_KEY[_KEYS[judged]].place.partition('/')[2]}, truth exact")

@@ -13,12 +13,12 @@ import numpy as np
 
 from slam.errors import SlamError
 from slam.evaluation.consistency import by_mounting
-from slam.evaluation.metrics import align, associate
+from slam.evaluation.metrics import associate
 from slam.evaluation.summary import rotation_errors
 from slam.evaluation.truth_error import interpolated, truth_covariances
 from slam.files import read_object, read_text
 from slam.geometry.se3 import Array, adjoint, inverse, transform
-from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.geometry.trajectory import Trajectory, TruthNoise, alignment
 from slam.naming import printable
 from slam.run.schema import OLD_LANDMARKS, STAGES
 
@@ -154,7 +154,7 @@ def place_of_truth(run: RunData) -> Array:
     own, true = _paired(run)
     T = own.poses[0] @ inverse(true.poses[0])
     if not run.truth_is_exact:
-        T[:3, :3] = align(true, own).R
+        T[:3, :3] = alignment(true, own)[:3, :3]
     T[:3, 3] = own.positions[0] - T[:3, :3] @ true.positions[0]
     return T
 

@@ -18,13 +18,18 @@ STAGE_NAMES = {
 }
 STAGES = tuple(STAGE_NAMES)
 
-#: Colours of bodies (red, green, blue); none is that of a path, a landmark or a loop.
+#: Colours of bodies (red, green, blue); none is that of a path, a landmark or a loop. Further bodies have them paler,
+#: then darker.
 _BODY_COLOURS = (216, 27, 96), (142, 36, 170), (0, 137, 123), (109, 76, 65), (130, 119, 23)
+_SHADES = (0.0, 255.0), (0.5, 255.0), (0.5, 0.0)  # how far towards white or black
 
 
 def body_colour(body: int) -> tuple[int, int, int]:
     """The colour (red, green, blue) of a moving body in images, maps and the viewer, by its id."""
-    return _BODY_COLOURS[(body - 1) % len(_BODY_COLOURS)]
+    again, which = divmod(body - 1, len(_BODY_COLOURS))
+    share, grey = _SHADES[again % len(_SHADES)]
+    red, green, blue = (round(part + share * (grey - part)) for part in _BODY_COLOURS[which])
+    return red, green, blue
 
 
 #: Frames of coordinates.

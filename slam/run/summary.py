@@ -122,6 +122,11 @@ def results_of(
         logger.warning(
             "the back end's trajectory() lacks %d of %d frames: it needs a pose for each", missing, len(path)
         )
+    none = int((np.linalg.eigvalsh(np.array(record.covariances[1:]).reshape(-1, 6, 6))[:, 0] <= 0).sum())
+    if none:
+        logger.warning(
+            "the back end claims a singular covariance for %d of %d poses: it is no uncertainty", none, len(path)
+        )
     online, steps = path.select(measured), np.diff(path.positions, axis=0)
     speeds = np.linalg.norm(steps, axis=1) / np.diff(path.stamps)
     common = [record.common[row] for row in np.flatnonzero(measured)]
@@ -141,6 +146,8 @@ def results_of(
             **consistency(online, np.array(record.covariances)[measured], sequence, common),
         },
     }
+    if none:
+        found["consistency"]["singular covariances"] = none
     noise: TruthNoise | None = getattr(sequence, "truth_noise", None)
     if found["accuracy"]["online"] and noise is not None:  # for the picture's band, which is that of the verdict
         found["truth"] = asdict(noise)

@@ -21,7 +21,6 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from functools import cache
 from types import CodeType, SimpleNamespace
 from typing import Any
@@ -249,13 +248,18 @@ class Stages:
     """Stages of one step, entered one after the other; their wall times [ms], without that in which kernels compile."""
 
     def __init__(self) -> None:
-        self.begun = False  # whether one has been entered
         self.milliseconds: dict[str, float] = {}
+        self.begun, self._since = "", 0.0  # the stage entered last, empty before the first, and when
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Enter a stage; where no exception ends it, its time adds to that of the same stage before."""
-        self.begun = True
-        start = working_time()
-        yield
-        self.milliseconds[name] = self.milliseconds.get(name, 0.0) + 1e3 * (working_time() - start)
+    def stage(self, name: str) -> Stages:
+        """``with`` this around a stage; where no exception ends it, its time adds to that of the same stage before."""
+        self.begun, self._since = name, working_time()
+        return self
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, *error: object) -> None:
+        if kind is None:
+            before = self.milliseconds.get(self.begun, 0.0)
+            self.milliseconds[self.begun] = before + 1e3 * (working_time() - self._since)

@@ -14,15 +14,16 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
-from slam.errors import ConfigurationError, SequenceError, UnknownNameError
+from slam import registry
+from slam.errors import ConfigurationError, PartError, SequenceError, SlamError, UnknownNameError, cause
 from slam.files import expanded, note_input, reason
 from slam.naming import nearest, unknown
+from slam.query import read_query
 from slam.sequences import euroc, folders, kitti, ros
 from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, logger, read_masks, turned
 from slam.sequences.folders import VIDEO_SUFFIXES
 from slam.sequences.images import IMAGE_SUFFIXES
 from slam.sequences.options import RECORDED, Options
-from slam.settings import read_query
 
 __all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
 
@@ -67,7 +68,8 @@ def open_sequence(path: str | Path, format: str | None = None, quiet: bool = Fal
         path: a folder or a ROS recording, with options behind it as ``PATH?key=value&key=value``;
             ``synthetic:NAME?key=value``; or ``camera:0?calibration=FILE``, see `slam.sequences.camera`.
             ``kind=driving`` or ``kind=handheld`` goes with all of them but the synthetic worlds.
-        format: one of `formats`; found out from the folder where it is None.
+        format: one of `formats`; found out from the folder where it is None. Or one of your own,
+            ``"my_module:open_folder"``, a function of folder, options and faults that returns a `RecordedSequence`.
         quiet: what is wrong with its files is kept in its `warnings` alone, and not logged.
 
     Raises:
@@ -104,13 +106,15 @@ def _open_folder(text: str, format: str | None, quiet: bool) -> RecordedSequence
     name = format or like or ""
     if not name:
         raise SequenceError(f"{folder}: no sequence of a known format ({', '.join(_FORMATS)}){_hint_near(folder)}")
-    if name not in _FORMATS:
+    if name not in _FORMATS and ":" not in name:
         raise UnknownNameError(unknown("format", name, formats()))
     options = Options(query, name, RECORDED)
     note_input(folder)
     lines: list[str] = []
     with FaultLog(lines, quiet=True) as faults:  # above an error nothing is said
-        found = _FORMATS[name].open(folder, options, faults)
+        found = (
+            _FORMATS[name].open(folder, options, faults) if name in _FORMATS else _own(name, folder, options, faults)
+        )
         masks = read_masks(options.get("mask"), folder if folder.is_dir() else folder.parent, found.rig)
         swap = options.get("swap", False)
         options.require_read(f"{folder} is read as {name}")
@@ -120,16 +124,27 @@ def _open_folder(text: str, format: str | None, quiet: bool) -> RecordedSequence
     return replace(found, ground_truth=truth, masks=masks, swap=swap, warnings=lines)
 
 
+def _own(name: str, folder: Path, options: Options, faults: FaultLog) -> RecordedSequence:
+    """A sequence of a format of somebody's own, ``module:function``."""
+    opener = registry.resolve("formats", name)
+    try:
+        found = opener(folder, options, faults)
+    except SlamError:
+        raise
+    except Exception as error:  # whatever a foreign function does
+        raise PartError(f"format {name!r}: {cause(error)}") from error
+    if not isinstance(found, RecordedSequence):
+        raise SequenceError(
+            f"format {name!r}: must return a slam.sequences.RecordedSequence, got {type(found).__name__}"
+        )
+    return found
+
+
 def _open_world(text: str) -> Sequence:
     from slam.worlds import open_world
 
-    name, mark, query = text.partition("?")
-    parts = query.split("&")
-    masks = [part for part in parts if part.startswith("mask=")]
-    opened = open_world(name + mark + "&".join(part for part in parts if part not in masks))
-    if masks:
-        opened.masks = read_masks(read_query(masks[-1])["mask"], Path.cwd(), opened.rig)
-        opened.name = text
+    opened = open_world(text)
+    opened.masks = read_masks(opened.values["mask"] or None, Path.cwd(), opened.rig)
     return opened
 
 

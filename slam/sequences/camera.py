@@ -15,11 +15,11 @@ from slam.data import StereoFrame
 from slam.errors import ConfigurationError, SequenceError
 from slam.files import expanded
 from slam.geometry.trajectory import Trajectory
+from slam.query import read_query
 from slam.sequences.base import FaultLog, as_used, read_masks
 from slam.sequences.images import both, grabbed_image, quiet_libraries, recorded_size, require_same_size, size_text
 from slam.sequences.options import CALIBRATION, Options
 from slam.sequences.rigs import calibration_files, read_rig
-from slam.settings import read_query
 
 OPTIONS = CALIBRATION | {"width", "height", "fps", "wait"}
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from slam.errors import ConfigurationError
-from slam.naming import suggestion
-from slam.settings import read_query
+from slam.query import number, read_query, word
 
 #: Options of every format whose calibration is in a file that can be named.
 CALIBRATION = frozenset({"calibration", "unit", "rectified", "fisheye", "kind", "mask", "swap"})
@@ -39,19 +37,8 @@ _RANGES = {
 def value_of(name: str, text: str) -> Any:
     """The value of an option: a word's, a number in its range, or the text; ConfigurationError where it is none."""
     if name in _WORDS:
-        if text not in _WORDS[name]:
-            raise ConfigurationError(f"{name} must be {' or '.join(_WORDS[name])}, got {text!r}")
-        return _WORDS[name][text]
-    if name in _RANGES:
-        low, high = _RANGES[name]
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high:
-            raise ConfigurationError(f"{name} must be a number from {low:g} to {high:g}, got {text!r}")
-        return value
-    return text
+        return _WORDS[name][word(name, text, _WORDS[name])]
+    return number(name, text, *_RANGES[name]) if name in _RANGES else text
 
 
 class Options(dict[str, Any]):
@@ -62,11 +49,7 @@ class Options(dict[str, Any]):
 
     def __init__(self, query: str, format: str, known: frozenset[str]) -> None:
         self._read = {"kind"}
-        texts = read_query(query)
-        strange = sorted(set(texts) - known)
-        if strange:
-            hint = f"{suggestion(strange[0], known)}; known: {', '.join(sorted(known))}"
-            raise ConfigurationError(f"unknown option {strange[0]!r} of format {format}{hint}")
+        texts = read_query(query, f"format {format}", known)
         super().__init__({name: value_of(name, text) for name, text in texts.items()})
 
     def __getitem__(self, name: str) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.files import expanded
 from slam.geometry.camera import PinholeCamera
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import NOT_SIDE_BY_SIDE, StereoRig
 from slam.geometry.se3 import Array, inverse, is_rotation, pose, so3_exp
 from slam.sequences.calibration import Entries, array, naming, plain_name, read_entries
 from slam.sequences.images import Size, recorded_size, size_text
@@ -81,7 +81,9 @@ def load_rig(
         if not files:
             raise CalibrationError(f"{folder}: no calibration under one of the usual names: name the file")
     rig = read_rig(files, size, options)
-    return StereoRig(*rig.as_recorded) if rig.turns else rig  # refused, unless the images are turned, too
+    if rig.turns:  # and the images are not
+        raise CalibrationError(NOT_SIDE_BY_SIDE)
+    return rig
 
 
 def read_rig(
@@ -109,6 +111,8 @@ def rig_of(entries: Entries, source: Path, size: Size | None, options: Mapping[s
             except ConfigurationError as error:
                 raise CalibrationError(str(error)) from None
         rig = _rig(entries, size, unit, rectified, fisheye)
+    if fisheye and "equidistant" not in (rig.left.model, rig.right.model):
+        raise ConfigurationError(f"option 'fisheye' does nothing with {source}: by it the images have no distortion")
     expected = recorded_size(rig)
     if size not in (None, expected):
         raise SequenceError(f"images are {size_text(size or ())}, but {source} is for {size_text(expected)}")

@@ -162,6 +162,8 @@ def assert_covariance(P: Array, shape: tuple[int, ...], what: str) -> None:
     """Fail unless P is finite, of that shape, symmetric and positive definite (or nearly)."""
     require(P.shape == shape, f"{what}: covariance of shape {P.shape}, {shape} expected")
     require(np.isfinite(P).all(), f"{what}: the covariance is not finite")
+    positive = not P.size or np.diagonal(P, axis1=-2, axis2=-1).min() > 0
+    require(positive, f"{what}: a variance is zero or negative, so the covariance is singular")
     scale = np.abs(P).max(initial=0.0)
     require(np.abs(P - np.swapaxes(P, -1, -2)).max(initial=0.0) <= 1e-9 * scale, f"{what}: covariance is not symmetric")
     definite = not len(P) or np.linalg.eigvalsh(P).min() > -1e-9 * scale

@@ -8,13 +8,13 @@ again, at the aligned position, once its size has changed by a fifth or it no lo
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 
 from slam.data import IdArray, Patches, StereoFeatures
 from slam.errors import SlamError
-from slam.geometry.arrays import Array, isin
+from slam.geometry.arrays import Array, changed, isin
 from slam.geometry.rig import StereoRig
 from slam.interfaces import AligningFrontend
 from slam.third_party import checked
@@ -23,6 +23,7 @@ from slam.tracks.table import LandmarkTable, Patch
 
 _LARGEST = 1.5  # largest factor by which a patch may have grown or shrunk: `Patches` hold no more
 _RENEWED = np.sqrt(_LARGEST)  # factor from which it is taken again, so that another such change stays below the largest
+_PARTS = attrgetter("image", "centre", "size", "T_world_left")  # of a `Patch`
 _FORGOTTEN = 10  # frames without a measurement after which a patch is dropped
 
 
@@ -42,8 +43,7 @@ def align(
     if matches.T_world_left is None or features.images is None or not usable.any():
         return features
     rows, at = matches.rows[usable], at[usable]
-    names = ("image", "centre", "size", "T_world_left")
-    images, centres, size, poses = (np.array([getattr(p, name) for p in landmarks.patches[at]]) for name in names)
+    images, centres, size, poses = map(np.array, zip(*map(_PARTS, landmarks.patches[at])))
     warps = warps_of(rig, poses, matches.T_world_left, positions(landmarks.ids[at]))
     growth = np.sqrt(np.abs(np.linalg.det(warps)))
     similar = (growth <= _LARGEST) & (growth * _LARGEST >= 1)
@@ -60,7 +60,7 @@ def align(
     uv_left, uv_right = features.uv_left.copy(), features.uv_right.copy()
     uv_left[rows[aligned]], uv_right[rows[aligned]] = left[aligned], right[aligned]
     landmarks.patches[at[~aligned | outgrown]] = None
-    return replace(features, uv_left=uv_left, uv_right=uv_right)
+    return changed(features, uv_left=uv_left, uv_right=uv_right)
 
 
 def take_patches(

@@ -72,14 +72,6 @@ def match_everywhere(
     return Matches(rows, best[rows])
 
 
-def pairs_near(centres: Array, reach: float, uv: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Pairs of rows of centres (M, 2) and of pixels (N, 2) within `reach` of them either way, by ascending centre."""
-    order = np.argsort(uv[:, 0], kind="stable")  # so that few pairs have to be tested
-    boxes = np.ascontiguousarray(centres), float(reach), np.ascontiguousarray(uv), order
-    rows, found, count = _pairs_near(*boxes)
-    return rows[:count], found[:count]
-
-
 @helper
 def first_column(uv, order, low):
     """First place in the `order` (N,) of columns whose pixel `uv` (N, 2) is not left of `low`."""
@@ -100,41 +92,6 @@ def grown(array, room):
     for k in range(len(array)):
         new[k] = array[k]
     return new
-
-
-@kernel
-def _pairs_near(centres, reach, uv, order):
-    """Rows of `pairs_near`, with room for more, and their number; `order` is that of the pixels' columns."""
-    count, room = 0, 8 * len(centres)
-    rows, found = np.empty(room, np.intp), np.empty(room, np.intp)
-    for row in range(len(centres)):
-        place, high = first_column(uv, order, centres[row, 0] - reach), centres[row, 0] + reach
-        while place < len(order) and uv[order[place], 0] <= high:
-            if abs(uv[order[place], 1] - centres[row, 1]) <= reach:
-                if count == room:
-                    room *= 2
-                    rows, found = grown(rows, room), grown(found, room)
-                rows[count], found[count] = row, order[place]
-                count += 1
-            place += 1
-    return rows, found, count
-
-
-@kernel
-def apart(uv, queue, wanted, separation):
-    """The first `wanted` rows of a queue (Q,) whose pixels are not closer together than the separation [px]."""
-    chosen, count = np.empty(min(wanted, len(queue)), np.intp), 0
-    for row in queue:
-        if count == len(chosen):
-            break
-        free = True
-        for k in range(count):
-            dx, dy = uv[row, 0] - uv[chosen[k], 0], uv[row, 1] - uv[chosen[k], 1]
-            free = free and dx * dx + dy * dy >= separation * separation
-        if free:
-            chosen[count] = row
-            count += 1
-    return chosen[:count]
 
 
 @helper

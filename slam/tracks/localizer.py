@@ -6,13 +6,13 @@ The same for every back end, which supplies predictions and positions, and is gi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, Prediction, StereoFeatures
-from slam.geometry.arrays import isin, median
+from slam.geometry.arrays import changed, isin, median
 from slam.geometry.rig import StereoRig, measurement_rows
 from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
 from slam.models import EstimatorModels
@@ -70,9 +70,9 @@ class Search:
                 standing = standing.contested(rig, sigma, self.features, matches.rows, matches.T_world_left)
             if standing.stands:
                 if 2 * isin(matches.rows, standing.witnesses).sum() <= len(matches):
-                    staying = replace(self, features=self.features.select(standing.witnesses))
+                    staying = changed(self, features=self.features.select(standing.witnesses))
                     matches, _ = staying.match_around(standing.T_world_left)
-                    matches = replace(matches, rows=standing.witnesses[matches.rows])
+                    matches = changed(matches, rows=standing.witnesses[matches.rows])
                 if len(matches) or standing.holds(tracking.lost):
                     return matches, tracking, standing
         return *self.localize(tracking, elsewhere), standing
@@ -95,13 +95,13 @@ class Search:
         if T is None:
             T = elsewhere()
             if T is None:
-                return matches, replace(tracking, doubted=NO_POSE)
+                return matches, changed(tracking, doubted=NO_POSE)
             if jump(self.prediction, T) <= farthest:
                 matches, _ = self.match_around(T)
         carried = tracking.carried(T)
         if carried:  # two, so that the place does not count as unknown: it is what hides the view
-            none = replace(LandmarkMatches.nothing(), doubted=len(matches))
-            return none, replace(tracking, doubted=PoseHypotheses(2, stamp, T))
+            none = changed(LandmarkMatches.nothing(), doubted=len(matches))
+            return none, changed(tracking, doubted=PoseHypotheses(2, stamp, T))
         hidden_at = tracking.hidden_at if carried is None else None
         allowed = jump(self.prediction, T) <= farthest
         if not allowed and tracking.believed.after(T, stamp, models).count > 1:
@@ -114,8 +114,8 @@ class Search:
             return matches, tracking.believing(T, stamp, hidden_at)
         doubted = tracking.doubted.after(T, stamp, models)
         if doubted.count < c.kidnapped_after:
-            return replace(LandmarkMatches.nothing(), doubted=len(matches)), replace(tracking, doubted=doubted)
-        nothing = replace(LandmarkMatches.nothing(), T_world_left=T, kidnapped=True)
+            return changed(LandmarkMatches.nothing(), doubted=len(matches)), changed(tracking, doubted=doubted)
+        nothing = changed(LandmarkMatches.nothing(), T_world_left=T, kidnapped=True)
         return nothing, tracking.believing(T, stamp)
 
     def match(self, doubtful: bool = False) -> LandmarkMatches:
@@ -208,7 +208,7 @@ class Search:
         awaited = awaited[matches.tracks]
         if not 0 < awaited.sum() < min(c.minimum_consistent, len(agreeing)):
             return agreeing
-        return replace(agreeing.select(~awaited), returning=agreeing.ids[awaited])
+        return changed(agreeing.select(~awaited), returning=agreeing.ids[awaited])
 
 
 def jump(prediction: Prediction, T_world_left: Array) -> float:

@@ -23,7 +23,7 @@ from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import Table
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, exp, inverse, points_by_pose
-from slam.tracks.follow import Matches, Windows, follow, pairs_near
+from slam.tracks.follow import Matches, Windows, follow
 from slam.tracks.table import Tracks
 
 _PARALLAX = np.deg2rad(1.0)  # least angle between the two rays
@@ -118,7 +118,7 @@ def unclaimed(uv: Array, descriptors: NDArray[np.float32], features: StereoFeatu
     """Those of the features `rows` (K,) to which no landmark in view, at pixels (M, 2), is near and looks alike."""
     if not len(rows) or not len(uv):
         return np.asarray(rows)
-    at, which = pairs_near(uv, _CLAIM, features.uv_left[rows])
+    at, which = np.nonzero(np.abs(uv[:, None] - features.uv_left[rows]).max(axis=2) <= _CLAIM)
     gap = np.linalg.norm(descriptors[at] - features.descriptors[rows[which]], axis=1)
     return np.delete(rows, which[gap < _D_MATCH])
 

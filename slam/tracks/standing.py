@@ -11,7 +11,7 @@ it is predicted depends on them, and they have neither a depth nor a prediction 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from slam.chi_square import SIGMAS, chi_square_limit
 from slam.data import StereoFeatures
-from slam.geometry.arrays import Table, median
+from slam.geometry.arrays import Table, changed, median
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig, measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.tracks.follow import Windows, follow
@@ -59,7 +59,7 @@ class Places(Table):
         keep = np.flatnonzero((missed <= sights) | (sights > _FRAMES))
         keep = np.sort(keep[np.argsort(missed[keep], kind="stable")][:3000])  # 3000: features
         new = np.delete(np.arange(len(z)), rows)
-        kept = replace(self, z=mean, sights=sights, missed=missed).select(keep)
+        kept = changed(self, z=mean, sights=sights, missed=missed).select(keep)
         return kept.joined(Places.of(z[new], features.select(new)))
 
 
@@ -109,7 +109,7 @@ class Standing:
         if at_rest:
             return Standing(places_after, self.frames + 1, witnesses, variance, self.T_world_left)
         if self.stands and len(rows) <= _FEW and self.blind < min(self.frames, _BLIND):
-            return replace(self, places=places_after, witnesses=witnesses, blind=self.blind + 1)
+            return changed(self, places=places_after, witnesses=witnesses, blind=self.blind + 1)
         return begun
 
     def contested(
@@ -126,7 +126,7 @@ class Standing:
 
     def moving(self) -> Standing:
         """The same features, of a camera that does not stand."""
-        return replace(self, frames=0)
+        return changed(self, frames=0)
 
 
 def _moved_share(

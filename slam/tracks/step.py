@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from slam.data import (
     UpdateReport,
     UpdateStatus,
 )
+from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array, inverse, log
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
@@ -84,11 +85,11 @@ class TrackingState:
             return TrackingState(doubted=self.doubted, believed=self.believed, stood=stands, hidden_at=self.hidden_at)
         unmeasured, enough = self.unmeasured + 1, stereo_features >= ENOUGH_FEATURES
         lost = self.lost or (uncertain and unmeasured >= lost_after)
-        return replace(self, unmeasured=unmeasured, unknown=self.unknown + enough, lost=lost, showed_enough=enough)
+        return changed(self, unmeasured=unmeasured, unknown=self.unknown + enough, lost=lost, showed_enough=enough)
 
     def believing(self, T_world_left: Array, stamp: float, hidden_at: Array | None = None) -> TrackingState:
         """A copy in which a pose (4, 4) at a time [s] is believed, and none is doubted."""
-        return replace(self, doubted=NO_POSE, believed=PoseHypotheses(1, stamp, T_world_left), hidden_at=hidden_at)
+        return changed(self, doubted=NO_POSE, believed=PoseHypotheses(1, stamp, T_world_left), hidden_at=hidden_at)
 
     def carried(self, T_world_left: Array) -> bool | None:
         """Whether at a pose (4, 4) a vehicle would have moved sideways from where its view was hidden, as none does.
@@ -129,7 +130,7 @@ class LandmarkMatches:
     def joined(self, more: LandmarkMatches) -> LandmarkMatches:
         """These and matches of other landmarks."""
         ids, rows = np.concatenate([self.ids, more.ids]), np.concatenate([self.rows, more.rows])
-        return replace(self, ids=ids, rows=rows)
+        return changed(self, ids=ids, rows=rows)
 
     def select(self, rows: NDArray) -> LandmarkMatches:
         """Some of the landmarks (a mask or indices)."""

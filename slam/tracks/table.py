@@ -94,37 +94,20 @@ class LandmarkTable(Table):
         self.returning[:] = 0
         self.returning[rows] = successive
 
-    def count_frame(
-        self, frame: int, in_view: IndexArray, measured: IndexArray, features: StereoFeatures,
-        feature_rows: IndexArray, descriptor_update: float = 1.0, camera: Array | None = None,
-        outside: IndexArray | slice = slice(0), rematch_after: int = 0, withheld: IndexArray | slice = slice(0),
+    def renew(
+        self, rows: IndexArray, features: StereoFeatures, feature_rows: IndexArray, weight: float, camera: Array,
+        rematch_after: int,
     ) -> None:  # fmt: skip
-        """Count a frame, in place, given which rows were in view, which were measured, and by which features.
+        """Landmarks (K,) were measured by features, from a `camera` at (3,) [m]: change how they look, in place.
 
-        `descriptor_update` is the weight of the new descriptors in the landmarks' own: 1 keeps the newest, 0 the first.
-        Rows `outside` lie outside of the image. If the camera's position (3,) [m] is given, landmarks seen again after
-        `rematch_after` frames outside the image count as first seen now, from there. For landmarks `withheld` from the
-        update, the frame counts as neither missed nor seen.
+        `weight` is that of the new descriptors in the landmarks' own: 1 keeps the newest, 0 the first. Landmarks seen
+        again after `rematch_after` frames outside the image count as first seen now, from there.
         """
-        counts, shown = np.ones(len(self.ids), bool), np.zeros(len(self.ids), bool)
-        counts[withheld] = False
-        view = in_view[counts[in_view]]
-        again = self.long_out_of_view(rematch_after)[measured]
-        shown[view] = shown[measured] = True
-        self.in_view[shown] += 1
-        self.missed[view] += 1
-        self.seen[measured] += 1
-        self.last_seen[measured] = frame
-        look = (1 - descriptor_update) * self.descriptors[measured]
-        look += descriptor_update * features.descriptors[feature_rows]
-        self.descriptors[measured] = look / np.maximum(np.linalg.norm(look, axis=1, keepdims=True), 1e-6)
-        if camera is not None:
-            self.seen_from[measured[again]] = camera
-            self.descriptors[measured[again]] = features.descriptors[feature_rows[again]]
-        self.out_of_view[outside] += 1
-        self.unseen[counts & (len(measured) > 0)] += 1
-        for column in (self.missed, self.out_of_view, self.unseen):
-            column[measured] = 0
+        look = (1 - weight) * self.descriptors[rows] + weight * features.descriptors[feature_rows]
+        self.descriptors[rows] = look / np.maximum(np.linalg.norm(look, axis=1, keepdims=True), 1e-6)
+        again = self.long_out_of_view(rematch_after)[rows]
+        self.seen_from[rows[again]] = camera
+        self.descriptors[rows[again]] = features.descriptors[feature_rows[again]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -120,27 +120,24 @@ def rig_columns(camera, poses, points, layout, E, rows, field, cross, inverse, B
                 F[i, k] = 0.0
                 for j in range(i + 1 if D[i, i % 2] != 0.0 else 0):  # none of what is not measured
                     F[i, k] += root[row, i, j] * field[row, j, k]
-        for k in range(m):
-            for i in range(3):
-                for a in range(6 if at >= 0 else 0):
-                    B[at + a, k] += J[i, a] * F[i, k]
-                for a in range(3 if place[p] != KNOWN else 0):
-                    gradient[p, a, k] += Jp[i, a] * F[i, k]
+        for a in range(6 if at >= 0 else 0):
+            for k in range(m):
+                B[at + a, k] += J[0, a] * F[0, k] + J[1, a] * F[1, k] + J[2, a] * F[2, k]
+        for a in range(3 if place[p] != KNOWN else 0):
+            for k in range(m):
+                gradient[p, a, k] += Jp[0, a] * F[0, k] + Jp[1, a] * F[1, k] + Jp[2, a] * F[2, k]
     for p in range(len(points)):
-        for k in range(m):
-            if place[p] >= 0:
-                for i in range(3):
-                    B[3 * place[p] + i, k] += gradient[p, i, k]
-            elif place[p] == ELIMINATED:
-                for i in range(3):
-                    for j in range(3):
-                        own[p, i, k] += inverse[p, i, j] * gradient[p, j, k]
+        g, its = gradient[p], own[p]
+        for i in range(3):
+            for k in range(m if place[p] >= 0 else 0):
+                B[3 * place[p] + i, k] += g[i, k]
+            for k in range(m if place[p] == ELIMINATED else 0):
+                its[i, k] = inverse[p, i, 0] * g[0, k] + inverse[p, i, 1] * g[1, k] + inverse[p, i, 2] * g[2, k]
         for o in range(first[p], first[p + 1] if place[p] == ELIMINATED else first[p]):
-            at = column[pose_of[order[o]]]
+            at, c = column[pose_of[order[o]]], cross[order[o]]
             for a in range(6 if at >= 0 else 0):
                 for k in range(m):
-                    for i in range(3):
-                        B[at + a, k] -= cross[order[o], a, i] * own[p, i, k]
+                    B[at + a, k] -= c[a, 0] * its[0, k] + c[a, 1] * its[1, k] + c[a, 2] * its[2, k]
     return own
 
 
@@ -160,17 +157,15 @@ def rig_points(layout, E, cross, inverse, own, X):
             for k in range(m):
                 d[i, k] = X[3 * place[p] + i, k] if place[p] >= 0 else own[p, i, k]
         for o in range(first[p], first[p + 1] if place[p] == ELIMINATED else first[p]):
-            at = column[pose_of[order[o]]]
-            for a in range(6 if at >= 0 else 0):
-                for j in range(3):
-                    for i in range(3):
-                        gain = inverse[p, i, j] * cross[order[o], a, j]
-                        for k in range(m):
-                            d[i, k] -= gain * X[at + a, k]
+            at, c = column[pose_of[order[o]]], cross[order[o]]
+            for i in range(3 if at >= 0 else 0):
+                for a in range(6):
+                    gain = inverse[p, i, 0] * c[a, 0] + inverse[p, i, 1] * c[a, 1] + inverse[p, i, 2] * c[a, 2]
+                    for k in range(m):
+                        d[i, k] -= gain * X[at + a, k]
         for i in range(3):
-            for j in range(3):
-                for k in range(m):
-                    out[p, i, k] += E[p, i, j] * d[j, k]
+            for k in range(m):
+                out[p, i, k] = E[p, i, 0] * d[0, k] + E[p, i, 1] * d[1, k] + E[p, i, 2] * d[2, k]
     return out
 
 

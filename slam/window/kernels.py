@@ -227,13 +227,13 @@ def by_point(point, count):
 
 @kernel
 def row_distances(camera, poses, points, rows):
-    """Square of each whitened residual (M,), ∞ without a left pixel or where the point is not before the camera."""
+    """Square of each whitened residual (M,), ∞ for a row that does not count, without a left pixel, or behind."""
     pose, point, z, root = rows
     out, q, r, D = np.empty(len(pose)), np.empty(3), np.empty(3), np.empty((3, 3))
     for m in range(len(pose)):
         transform_back(poses[pose[m]], points[point[m]], q)
         front = whitened_residual(camera, q, z[m], root[m], r, D)
-        out[m] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2] if front and sees(z[m]) else np.inf
+        out[m] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2] if front and sees(z[m]) and root[m, 0, 0] != 0.0 else np.inf
     return out
 
 

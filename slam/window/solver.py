@@ -165,7 +165,7 @@ def _gauss_newton(w: Window, centre: int, huber: float, close: float, steps: int
 def row_distances(w: Window) -> Array:
     """Squared distance of each row (M,) from its prediction by poses and points as they are.
 
-    It is ∞ for a row without a left pixel, and behind the camera.
+    It is ∞ for a row that does not count or has no left pixel, and behind the camera.
     """
     return np.asarray(kernels.row_distances(w.stereo.intrinsics, w.poses, w.points, w.rows.arrays))
 

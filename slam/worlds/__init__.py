@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from slam.errors import UnknownNameError
+from slam import registry
+from slam.errors import ConfigurationError, UnknownNameError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import so3_exp
 from slam.naming import unknown
@@ -28,7 +29,7 @@ __all__ = ["WorldSequence", "describe", "describe_common", "names", "open_world"
 
 #: Options that change the world itself; the others only change how it is recorded.
 _RECORDING_ONLY = {o.name for o in (*OBSERVATION, *IMAGING, *FAULTS)} - {"density"}
-_RECORDING_ONLY |= {"seed", "focal_error", "turn_error"}
+_RECORDING_ONLY |= {"seed", "mask", "focal_error", "turn_error"}
 
 
 def names() -> list[str]:
@@ -38,6 +39,8 @@ def names() -> list[str]:
 
 def open_world(text: str) -> WorldSequence:
     """The recording that a text such as ``"aisle?frames=200&seed=3"`` describes.
+
+    A world of one's own is ``"my_module:SCENE?frames=200"``, a `slam.worlds.scenes.Scene`.
 
     Raises:
         UnknownNameError: there is no such world.
@@ -72,6 +75,11 @@ def describe(name: str) -> str:
 
 
 def _scene(name: str) -> Scene:
+    if ":" in name:
+        found = registry.resolve("worlds", name)
+        if not isinstance(found, Scene):
+            raise ConfigurationError(f"world {name!r} is no slam.worlds.scenes.Scene")
+        return found
     if name not in SCENES:
         raise UnknownNameError(unknown("world", name, tuple(SCENES)))
     return SCENES[name]
@@ -80,7 +88,7 @@ def _scene(name: str) -> Scene:
 @lru_cache(maxsize=8)
 def _build(name: str, key: tuple[tuple[str, Any], ...]) -> World:
     """A world, kept for the next recording of it: Monte-Carlo runs differ in `seed` alone."""
-    scene = SCENES[name]
+    scene = _scene(name)
     return assemble(name, scene, dict(key), scene.build(dict(key)))
 
 

@@ -53,7 +53,6 @@ class VisibleLandmarks:
     points: Array  # in left-camera coordinates (M, 3) [m]
     uv_left: Array  # left pixels (M, 2)
     uv_right: Array  # right pixels (M, 2), NaN where the right camera does not see it
-    in_right: BoolArray  # whether it does (M,)
     size: Array  # diameters in the left image (M,) [px]
 
 
@@ -85,7 +84,7 @@ def visible_landmarks(world: World, frame: int) -> VisibleLandmarks:
         rows, uv_left, uv_right = rows[seen], uv_left[seen], uv_right[seen]
         uv_right[hidden(right_centre, positions[rows], occluders)] = np.nan
     size = np.maximum(world.rig.left.fu * landmarks.size[rows] / points[rows, 2], _SMALLEST)
-    return VisibleLandmarks(near[rows], points[rows], uv_left, uv_right, np.isfinite(uv_right[:, 0]), size)
+    return VisibleLandmarks(near[rows], points[rows], uv_left, uv_right, size)
 
 
 def _views(world: World, frame: int, seen: VisibleLandmarks, source: IdArray) -> Array:
@@ -117,7 +116,7 @@ def simulate(
     rig, seen = world.rig, visible_landmarks(world, frame)
     chance = rng.random((len(seen.ids), 3))
     rows = np.flatnonzero(chance[:, 0] < values["detect"])
-    matched = seen.in_right[rows] & (chance[rows, 1] < values["stereo"])
+    matched = np.isfinite(seen.uv_right[rows, 0]) & (chance[rows, 1] < values["stereo"])
     noise = values["sigma"] * rng.standard_normal((len(rows), 3))
     uv_left = seen.uv_left[rows] + noise[:, :2]
     uv_right = np.full_like(uv_left, np.nan)

@@ -10,8 +10,7 @@ import numpy as np
 
 from slam.data import BoolArray
 from slam.errors import ConfigurationError
-from slam.naming import suggestion
-from slam.settings import read_query
+from slam.query import number, read_query, word
 
 
 @dataclass(frozen=True)
@@ -28,18 +27,8 @@ class Option:
     def parse(self, text: str) -> int | float | str:
         """The value that a text means; raises ConfigurationError."""
         if isinstance(self.default, str):
-            if self.choices and text not in self.choices:
-                raise ConfigurationError(f"{self.name} must be one of {', '.join(self.choices)}, got {text!r}")
-            return text
-        kind = type(self.default)
-        try:
-            value = kind(text)
-        except ValueError:
-            what = "a whole number" if kind is int else "a number"
-            raise ConfigurationError(f"{self.name} must be {what}, got {text!r}") from None
-        if not self.low <= value <= self.high:
-            raise ConfigurationError(f"{self.name} must lie in {self.range}, got {text}")
-        return value
+            return word(self.name, text, self.choices) if self.choices else text
+        return number(self.name, text, self.low, self.high, isinstance(self.default, int))
 
     @property
     def range(self) -> str:
@@ -61,6 +50,7 @@ RECORDING = (
     Option("height", 240, "image height [px]", 48, 4096),
     Option("baseline", 0.12, "distance between the cameras [m]", 0.01, 10),
     Option("focal_error", 0.0, "relative error of the focal length in the calibration; positive: too long", -0.2, 0.2),
+    Option("mask", "", "image, black where features are not used; two joined by a comma for left and right"),
     Option("turn_error", 0.0, "turn of the right camera about each axis, not in the calibration [mrad]", -50, 50),
 )
 
@@ -110,16 +100,8 @@ def parse_query(world: str, query: str, table: Mapping[str, Option]) -> dict[str
     Raises:
         ConfigurationError: a key is unknown or stands twice, or a value has a wrong type or lies outside its range.
     """
-    given: dict[str, Any] = read_query(query)
-    for key, text in given.items():
-        if key not in table:
-            known = f"{suggestion(key, table)}; known: {', '.join(sorted(table))}"
-            raise ConfigurationError(f"world {world!r} has no option {key!r}{known}")
-        try:
-            given[key] = table[key].parse(text)
-        except ConfigurationError as error:
-            raise ConfigurationError(f"world {world!r}: {error}") from None
-    return {name: o.default for name, o in table.items()} | given
+    texts = read_query(query, f"world {world}", table)
+    return {name: o.parse(texts[name]) if name in texts else o.default for name, o in table.items()}
 
 
 def faulty_frames(values: Mapping[str, Any], frames: int, seed: int) -> dict[str, BoolArray]:

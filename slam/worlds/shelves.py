@@ -132,7 +132,7 @@ def _woodwork(page: Page, bay: Bay) -> None:
     top = max(round((boards[0] - ROW) * density), thick)
     canvas[:top] = wood((top, width), rng, density, _WOOD)
     wide, narrow = (round(share * UPRIGHT / 2 * density) for share in (2, 1))
-    left, right = wide if bay.number == 0 else narrow, wide if bay.last else narrow
+    left, right = wide if bay.number == 0 else narrow, wide if bay.number == bay.wall.bays - 1 else narrow
     for x, thick in ((0, left), (width - right, right)):
         canvas[:, x : x + thick] = wood((thick, height), rng, density, _WOOD).transpose(1, 0, 2)
     canvas[:, left : left + 3] //= 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -107,36 +108,21 @@ class Shelves:
         return np.concatenate([labels, np.stack([b.left + b.lean, b.top, 0.6 * b.width], axis=1)])
 
     def parts(self) -> list[Bay]:
-        """The bays, from the left."""
-        return [Bay(self, number) for number in range(self.bays)]
+        """The bays, from the left; each reaches from the middle of one upright to that of the next."""
+        inside = (number * BAY + UPRIGHT / 2 for number in range(1, self.bays))
+        edges = pairwise([0.0, *inside, self.width])
+        return [Bay(self, number, left, right - left, self.height) for number, (left, right) in enumerate(edges)]
 
 
 @dataclass(frozen=True)
 class Bay:
-    """One bay, between the middles of its uprights."""
+    """One bay of a wall of bookshelves."""
 
     wall: Shelves
     number: int  # from the left
-
-    @property
-    def last(self) -> bool:
-        """Whether the wall ends with it."""
-        return self.number == self.wall.bays - 1
-
-    @property
-    def left(self) -> float:
-        """Where it begins on the wall [m]."""
-        return self.number * BAY + UPRIGHT / 2 if self.number else 0.0
-
-    @property
-    def width(self) -> float:
-        """Its width [m]."""
-        return (self.wall.width if self.last else (self.number + 1) * BAY + UPRIGHT / 2) - self.left
-
-    @property
-    def height(self) -> float:
-        """Its height [m]."""
-        return self.wall.height
+    left: float  # where it begins on the wall [m]
+    width: float  # [m]
+    height: float  # [m]
 
     def marks(self) -> Array:
         """None: the whole wall has them."""

@@ -72,13 +72,3 @@ def test_patches_are_not_looked_for_beyond_all_images(value):
     start = np.array([[value, 120.0], [120.0, value], [value, value]])
     for found in frontend.align(pair, patches, np.tile(np.eye(2), (3, 1, 1)), start, start):
         assert np.isnan(found).all()
-
-
-def test_patches_at_the_border_are_not_found():
-    frontend = SurfFrontend(RIG)
-    left, right = (image.astype(np.float32) for image in stereo_pair(DISPARITY))
-    uv = np.array([[0.0, 0.0], [319.0, 239.0], [160.0, 120.0], [6.0, 120.0]])
-    patches = frontend.patches(ImagePair(left, right), uv, np.full(4, 15.0))
-    found, _ = frontend.align(ImagePair(left, right), patches, np.tile(np.eye(2), (4, 1, 1)), uv, uv)
-    assert np.isfinite(found[:, 0]).tolist() == [False, False, True, False]
-    assert found[2] == pytest.approx(uv[2], abs=0.01)

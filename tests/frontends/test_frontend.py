@@ -10,7 +10,7 @@ import pytest
 import frontends
 from frontends.surf import SurfFrontend
 from slam.data import StereoFrame
-from slam.errors import ConfigurationError, SequenceError
+from slam.errors import SequenceError
 from slam.geometry.rig import StereoRig
 from slam.interfaces import Frontend
 from tests.frontends.scenes import stereo_pair
@@ -128,20 +128,6 @@ def test_threshold_keeps_the_number_of_features():
 def test_unusable_images(left, right, says):
     with pytest.raises(SequenceError, match=says):
         SurfFrontend(RIG).extract(StereoFrame(7, 0.0, left, right))
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"colour": 1}, "surf: unknown option 'colour'; known: features, "),
-        ({"features": 10.5}, "surf: features "),
-        ({"descriptor": 32}, "surf: descriptor must be 16 or 64"),
-        ({"min_depth": 5, "max_depth": 2}, "surf: min_depth "),
-    ],
-)
-def test_bad_options_name_their_key(options, says):
-    with pytest.raises(ConfigurationError, match=f"^{says}"):
-        SurfFrontend(RIG, **options)
 
 
 def test_without_a_folder_for_the_cache_kernels_still_run(monkeypatch, caplog):

@@ -39,16 +39,7 @@ def videos(folder: Path) -> Path:
     return folder
 
 
-def folders(folder: Path) -> Path:
-    """Two folders of images with OpenCV's calibration in JSON, and times."""
-    root = recordings.write_two_folders(folder)
-    (root / "calibration.yaml").unlink()
-    recordings.write_storage(root / "calibration.json", recordings.stereo_entries())
-    (root / "times.txt").write_text("".join(f"{0.1 * k}\n" for k in range(6)))
-    return root
-
-
-WRITERS = (recordings.write_euroc, recordings.write_kitti, raw, recordings.write_two_folders, folders, videos)
+WRITERS = (recordings.write_euroc, recordings.write_kitti, raw, recordings.write_two_folders, videos)
 
 
 @cache

@@ -18,7 +18,7 @@ from slam.calibration.saved import SavedCalibration, load_calibration
 from slam.config import SystemConfig
 from slam.geometry.rig_numbers import rig_numbers
 from slam.run.options import RunOptions
-from slam.run.recording import load_recording, record, save_recording
+from slam.run.recording import RecordedFrame, Recording, load_recording, save_recording
 from slam.run.run_data import RunData
 from slam.run.runner import run_recording
 from slam.system import StereoSlam
@@ -34,7 +34,8 @@ def _files() -> dict[str, bytes]:
     rig, frames = scene()
     folder = Path(tempfile.mkdtemp(prefix="fuzz_"))
     system = StereoSlam(rig, None, "ekf")
-    recording = record([system.process_features(f) for f in frames], rig, system.config.models, "desk")
+    given = tuple(RecordedFrame.of(system.process_features(f)) for f in frames)
+    recording = Recording("desk", rig, system.config.models, given)
     save_recording(recording, folder / "a.npz")
     run_recording(recording, RunOptions("ekf", "recording", SystemConfig(), folder / "run"))
     rig_errors = json.dumps(SavedCalibration(system.calibration.posterior, rig_numbers(rig)).to_json())

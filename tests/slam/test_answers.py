@@ -9,13 +9,11 @@ import pytest
 
 from backends.ekf import EkfBackend
 from frontends.surf import SurfFrontend
-from slam.config import SystemConfig
-from slam.data import Patches, StereoFrame
+from slam.data import StereoFrame
 from slam.errors import ConfigurationError, MeasurementError, PartError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
-from slam.third_party import named_failures
 from tests.frontends.scenes import stereo_pair
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
@@ -53,46 +51,6 @@ def test_a_back_end_of_nonsense_is_named(method, change, words):
     with pytest.raises(SlamError, match=f"^frame [01]: Changed.{words}"):
         for stamp in (0.0, 0.1):  # positions are asked for once there are landmarks
             system.process(LEFT, RIGHT, stamp)
-
-
-class Spoilt(SurfFrontend):
-    """SURF with one answer replaced."""
-
-    answers: dict
-
-    def patches(self, images, uv_left, size):
-        change = self.answers.get("patches")
-        return change(super().patches(images, uv_left, size)) if change else super().patches(images, uv_left, size)
-
-    def align(self, images, patches, warps, uv_left, uv_right):
-        found = super().align(images, patches, warps, uv_left, uv_right)
-        return self.answers["align"](found) if "align" in self.answers else found
-
-
-def aligning(**answers) -> StereoSlam:
-    frontend = Spoilt(RIG, features=150)
-    frontend.answers = answers
-    config = SystemConfig()
-    config = replace(config, association=replace(config.association, align=True))
-    return StereoSlam(RIG, frontend, "ekf", config=config)
-
-
-WRONG = [
-    ("patches", lambda p: Patches(p.images, p.centres[:, :1], p.size), "patches: centres"),
-    ("align", lambda f: (f[0][:-1], f[1]), "align: must give left and right"),
-]
-
-
-@pytest.mark.parametrize("method,change,words", WRONG)
-def test_a_front_end_of_nonsense_is_named_and_the_next_frame_is_taken(method, change, words):
-    system = aligning(**{method: change})
-    with pytest.raises(SlamError, match=f"Spoilt.{words}"):
-        for k in range(3):
-            system.process(LEFT ^ (k % 2), RIGHT ^ (k % 2), 0.1 * k)  # a still camera has noise
-    system.frontend.answers = {}
-    for k in range(3, 6):
-        result = system.process(LEFT ^ (k % 2), RIGHT ^ (k % 2), 0.1 * k)  # a still camera has noise
-    assert result.status.measured
 
 
 def test_a_front_end_whose_features_are_no_features_ends_in_one_line():
@@ -144,14 +102,6 @@ def test_a_front_end_that_stops_does_not_end_the_frames():
     for overlap in (True, False):
         with pytest.raises(PartError, match=r"^frame 0: Blind.extract failed: StopIteration"):
             list(system.run(frames, overlap))
-
-
-def test_exceptions_of_our_own_parts_and_interrupts_go_on():
-    for error in (ValueError("a defect"), np.linalg.LinAlgError("singular")):
-        with pytest.raises(type(error)), named_failures("frame 0", EkfBackend(RIG, models=EstimatorModels())):
-            raise error
-    with pytest.raises(KeyboardInterrupt), named_failures("frame 0", Failing("predict", ValueError())):
-        raise KeyboardInterrupt
 
 
 def test_what_is_no_part_is_refused():

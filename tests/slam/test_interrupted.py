@@ -6,11 +6,9 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,8 +16,6 @@ import pytest
 import slam
 from slam.config import SystemConfig
 from slam.data import FrameStatus
-from slam.errors import MeasurementError, PartError
-from slam.geometry import se3
 from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
 from slam.system import StereoSlam
@@ -122,27 +118,6 @@ def test_interrupted_where_a_body_moves(backend):
     interrupt_often(system, frames, 5)
 
 
-@pytest.mark.parametrize("stage", ["update", "close_loops"])
-def test_what_waits_for_a_depth_waits_on_after_an_interrupted_step(stage):
-    """Features without a right pixel, before a camera that moves sideways, join the map as without an interrupt."""
-    added = []
-    for stopped in (None, 3):
-        cloud, config = Cloud(150), CONFIG.with_settings(["map.monocular=true", "map.target_in_view=150"])
-        system, joined = StereoSlam(RIG, None, "ekf", config=config), []
-        for k in range(8):
-            features, ids = cloud.features(se3.exp(np.array([0, 0, 0, 0.012 * k, 0, 0])), k / 30)
-            features.uv_right[ids >= 60] = np.nan
-            with pytest.MonkeyPatch.context() as patch:
-                if k == stopped:
-                    patch.setattr(system._tracker, stage, Mock(side_effect=KeyboardInterrupt))
-                    with pytest.raises(KeyboardInterrupt):
-                        system.process_features(features)
-                else:
-                    joined.append(len(system.process_features(features).added))
-        added.append(joined[-4:])
-    assert added[0] == added[1] and sum(added[0]) > 10
-
-
 @pytest.mark.parametrize("case", [*BACKENDS, "in a map"])
 def test_the_step_that_starts_or_finds_the_camera_in_a_map_may_be_interrupted(case):
     cloud, counter, hits = Cloud(150), Lines(), 0
@@ -162,44 +137,6 @@ def test_the_step_that_starts_or_finds_the_camera_in_a_map_may_be_interrupted(ca
         assert [r.status for r in results[1:]] == [FrameStatus.TRACKED] * 2, line
         assert_agree(system)
     assert hits > 4
-
-
-class Failing:
-    """A back end whose `add` does its work and then fails, once."""
-
-    def __init__(self, backend: Any) -> None:
-        self._backend, self.fail = backend, False
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._backend, name)
-
-    def add(self, observations: Any) -> None:
-        self._backend.add(observations)
-        if self.fail:
-            self.fail = False
-            raise RuntimeError("no more memory")
-
-
-def test_the_same_frame_again_is_refused_in_plain_words_and_the_map_is_whole():
-    cloud = Cloud(150)
-    keeps = CONFIG.with_settings(["atlas.enabled=false"])  # so that the same back end goes on in an unknown place
-    system = StereoSlam(RIG, None, "ekf", config=keeps)
-    system.backend = Failing(system.backend)
-    for k, T in enumerate(path(10)):
-        system.process_features(cloud.features(T, k / 30, 0.3)[0])
-    before, system.backend.fail = system.landmarks, True
-    fresh = Cloud(150, seed=1).features(np.eye(4), 1.0)[0]  # another place: nothing is known, much is new
-    for k in range(40):
-        try:
-            system.process_features(replace(fresh, stamp=1.0 + k / 30))
-        except PartError:
-            break
-    assert not system.backend.fail  # it was reached
-    with pytest.raises(MeasurementError, match="not later"):
-        system.process_features(replace(fresh, stamp=1.0 + k / 30))
-    assert len(system.snapshot()) == len(system.landmarks) == len(before)
-    system.process_features(replace(fresh, stamp=1.1 + k / 30))
-    assert_agree(system)
 
 
 @pytest.fixture(scope="module", autouse=True)

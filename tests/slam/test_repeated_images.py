@@ -59,14 +59,3 @@ def test_a_camera_that_stands_still_is_tracked_by_its_noise():
     s = system()
     results = [s.process(frame) for frame in shown(list(range(12)), [*FRAMES[:6], *still])]
     assert {r.status for r in results[1:]} == {FrameStatus.TRACKED} and s.warnings == []
-
-
-def test_the_camera_is_looked_for_in_a_map_as_long_as_it_is_not_found():
-    first = system()
-    for frame in shown(list(range(8))):
-        first.process(frame)
-    s = slam.StereoSlam(SEQUENCE.rig, "surf", "ekf", prior_map=first.snapshot())
-    noise = [np.random.default_rng(k).integers(0, 255, FRAMES[0].left.shape, np.uint8) for k in range(2)]
-    results = [s.process(f) for f in shown([0, 0, 1, 1, 2], [StereoFrame(0, 0.0, *noise), *FRAMES[3:5]])]
-    assert [r.located for r in results] == [False, False, True, True, True]
-    assert repeats(results) == [3]

@@ -139,6 +139,5 @@ def test_two_arrays_and_a_time_are_a_frame():
         by_arrays.process(frame.left, frame.right, "now")
     with pytest.raises(SequenceError, match="calibration is for 160x120"):
         by_arrays.process(frame.left[:60], frame.right, frame.stamp + 2)
-    for thing in (["a list has an index method"], "and so has a text"):
-        with pytest.raises(MeasurementError, match=r"a frame must be a StereoFrame, got (list|str)"):
-            list(by_arrays.run([thing]))
+    with pytest.raises(MeasurementError, match=r"a frame must be a StereoFrame, got list"):
+        list(by_arrays.run([["a list has an index method"]]))

@@ -130,22 +130,3 @@ def test_what_was_seen_before_is_found_again_where_the_camera_returns_at_once(se
     assert np.linalg.norm(last.estimate.T_world_left[:3, 3] - truth) < 0.3
     assert np.sqrt(np.trace(last.estimate.covariance[3:, 3:])) < 1.0
     assert np.sqrt(np.trace(results[75].estimate.covariance[3:, 3:])) > 2.0
-
-
-def test_an_interrupt_while_the_map_begins_anew_leaves_a_system_that_goes_on(sequence, monkeypatch):  # noqa: F811
-    done = Run(sequence, "ekf")
-    system = system_for(sequence, "ekf")
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    for r in done.results[: done.begins]:
-        system.process_features(r.features)
-    with monkeypatch.context() as patch:
-        patch.setattr("slam.system.frame_result", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            system.process_features(done.results[done.begins].features)
-    statuses = [system.process_features(r.features).status.value for r in done.results[done.begins + 1 :][:15]]
-    assert statuses[-5:] == ["tracked"] * 5
-    system.estimate()
-    assert isinstance(system.snapshot(), slam.SavedMap)

@@ -29,11 +29,14 @@ def test_a_run_knows_the_kind_of_motion_of_its_sequence(mode, tmp_path, monkeypa
     assert kinds == ["driving"]
 
 
-def test_what_was_run_with_other_settings_or_frames_is_not_done(tmp_path):
+def test_what_was_run_with_other_settings_frames_or_versions_is_not_done(tmp_path, monkeypatch):
     """It lies there where a comparison that replaces another one was interrupted."""
     trial = Trial("synthetic:desk?frames=5", "ekf", settings=("frontend.features=100",))
     keep_result(trial, tmp_path / RUNS / trial.folder, COMPLETED, {"ate_online_m": 0.1})
     assert is_done(trial, tmp_path)
+    monkeypatch.setattr("slam.compare.sweep.versions", lambda: {"numpy": "0.1"})
+    assert not is_done(trial, tmp_path)
+    monkeypatch.undo()
     other = replace(trial, settings=("frontend.features=900",))
     assert not is_done(other, tmp_path) and not is_done(replace(trial, stop=3), tmp_path)
 

@@ -162,6 +162,10 @@ SAID = {
         every(3), {"rig": slam.StereoRig(*2 * [OBLONG], np.eye(3), np.array([-0.12, 0, 0]))},
         "300 px along rows and 350 px along columns, differ, but pixels are square",
     ),
+    "fy of both cameras": (
+        every(3), {"rig": slam.StereoRig(*(replace(c, fv=1.07 * c.fv) for c in (RIG.left, RIG.right)), RIG.R, RIG.b)},
+        "along rows and columns differ by 7 %: pixels of digital cameras are square",
+    ),
     "mirrored": (every(1, lambda a, b: (a, b[:, ::-1].copy())), {"stereo": 40}, "one of the images looks mirrored"),
     "fy of one camera": (
         every(3), {"rig": slam.StereoRig(replace(RIG.left, fv=275.0), RIG.right, RIG.R, RIG.b)},

@@ -48,12 +48,6 @@ def test_factorise_and_solve(n, rng):
     np.testing.assert_allclose(x, np.linalg.solve(M, v), rtol=1e-9, atol=1e-12)
 
 
-def test_inverses(rng):
-    M = positive(3, rng)
-    inverse = filled(linear.invert_symmetric, M, 0.5, shape=(3, 3))
-    np.testing.assert_allclose(inverse, np.linalg.inv(M + 0.5 * np.eye(3)), rtol=1e-12)
-
-
 def test_whitening(rng):
     C, g = positive(3, rng), rng.normal(size=3)
     W = filled(linear.whitener, C, shape=(3, 3))
@@ -63,18 +57,6 @@ def test_whitening(rng):
     left = np.array([*g[:2], np.nan])
     assert call(linear.squared_distance, left, C) == pytest.approx(g[:2] @ np.linalg.solve(C[:2, :2], g[:2]), rel=1e-12)
     assert np.isnan(filled(linear.whitener, np.diag([1.0, -1.0, 1.0]), shape=(3, 3))[1, 1])
-
-
-def test_products(rng):
-    M, v, R = positive(3, rng), rng.normal(size=3), T[:3, :3].copy()
-    A = rng.normal(size=(3, 3))
-    assert call(linear.row_times, A, 1, v) == pytest.approx((A @ v)[1], rel=1e-14)
-    assert call(linear.column_times, A, 1, v) == pytest.approx((A.T @ v)[1], rel=1e-14)
-    np.testing.assert_allclose(filled(linear.multiply, A, M, shape=(3, 3)), A @ M, rtol=1e-13, atol=1e-15)
-    assert call(linear.square, A, v) == pytest.approx(v @ A @ v, rel=1e-13)
-    assert call(linear.trace, A) == pytest.approx(np.trace(A))
-    np.testing.assert_allclose(filled(linear.turn, R, M, shape=(3, 3)), R @ M @ R.T, rtol=1e-13)
-    np.testing.assert_allclose(filled(linear.turn_back, R, M, shape=(3, 3)), R.T @ M @ R, rtol=1e-13)
 
 
 @pytest.mark.parametrize("turn", STEPS)
@@ -89,15 +71,6 @@ def test_exponential_and_logarithm(turn):
     moved = T.copy()
     call(se3.move, moved, xi)
     np.testing.assert_allclose(moved, T @ reference.exp(xi), rtol=0, atol=1e-14)
-
-
-def test_poses():
-    np.testing.assert_allclose(filled(se3.transform, T, POINT, shape=3), (T @ [*POINT, 1])[:3], rtol=1e-14)
-    back = filled(se3.transform_back, T, POINT, shape=3)
-    np.testing.assert_allclose(back, (np.linalg.inv(T) @ [*POINT, 1])[:3], rtol=1e-13)
-    np.testing.assert_allclose(filled(se3.compose, T, OTHER, shape=(3, 4)), (T @ OTHER)[:3], rtol=1e-13)
-    np.testing.assert_allclose(filled(se3.between, T, OTHER, shape=(3, 4)), (np.linalg.inv(T) @ OTHER)[:3], rtol=1e-12)
-    np.testing.assert_allclose(filled(se3.adjoint, T, shape=(6, 6)), reference.adjoint(T), rtol=1e-13, atol=1e-15)
 
 
 def test_derivatives_of_a_point_by_a_motion():

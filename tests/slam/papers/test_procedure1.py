@@ -5,7 +5,7 @@ import pytest
 
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
-from slam.geometry.se3 import exp, inverse, log, pose, rotation, transform
+from slam.geometry.se3 import angles, exp, inverse, log, pose, rotation, transform
 from slam.papers.procedure1 import (
     ObjectDatabase,
     body_frame,
@@ -51,10 +51,10 @@ def test_detects_the_motion_and_prints_rpy():
     moved = transform(MOTION, POINTS)
     features = features_of(moved)
     matches = (np.arange(4), np.arange(4))
-    found = detect(features, matches, moved, database, 0.03, 0.2)
+    found = detect(features, matches, moved, database)
     assert found.reason == ""
     np.testing.assert_array_equal(found.triple, [0, 1, 2])  # the largest determinants
-    np.testing.assert_allclose(np.degrees(found.rpy), [-35.0, -15.1, 5.8], atol=1e-6)
+    np.testing.assert_allclose(np.degrees(angles(found.R)), [-35.0, -15.1, 5.8], atol=1e-6)
     np.testing.assert_allclose(found.translation, moved[0] - POINTS[0], atol=1e-9)
 
 
@@ -63,22 +63,21 @@ def test_detects_the_motion_and_prints_rpy():
     [
         ([[0, 0, 1], [0.1, 0, 1], [0.2, 0.001, 1]], "collinear"),
         ([[0, 0, 1], [0.01, 0, 1], [0.2, 0.2, 1]], "apart"),
-        ([[0, 0, 1], [0, 0, 1], [0.2, 0.2, 1]], "nearly the same"),
         ([[0, 0, 1], [0.1, 0, np.nan], [0.2, 0.2, 1]], "no depth"),
         ([[0, 0, 1], [0.1, 0, 1], [0, 0.1, 1]], ""),
     ],
 )
 def test_degenerate_triples_are_refused(points, reason):
-    why = why_degenerate(np.array(points, float), 0.03, 0.2)
+    why = why_degenerate(np.array(points, float))
     assert (reason in why) if reason else why == ""
 
 
 def test_next_triple_is_taken_where_the_first_is_degenerate():
     points = np.array([[0, 0, 1.0], [0.1, 0, 1], [0.2, 0.001, 1], [0.1, 0.15, 1.1]])
     database = ObjectDatabase.of(features_of(points), np.arange(4), RIG, np.eye(4))
-    found = detect(features_of(points), (np.arange(4), np.arange(4)), points, database, 0.03, 0.2)
+    found = detect(features_of(points), (np.arange(4), np.arange(4)), points, database)
     assert found.reason == "" and 3 in found.triple
-    two = detect(features_of(points), (np.arange(2), np.arange(2)), points[:2], database, 0.03, 0.2)
+    two = detect(features_of(points), (np.arange(2), np.arange(2)), points[:2], database)
     assert "3 are needed" in two.reason
 
 

@@ -11,7 +11,7 @@ import pytest
 from slam.atlas.map_io import load_map
 from slam.config import SystemConfig
 from slam.errors import SlamError
-from slam.files import RowFile, whole_file
+from slam.files import whole_file
 from slam.run import runner
 from slam.run.options import RunOptions
 from slam.run.recording import load_recording
@@ -38,16 +38,6 @@ def test_a_file_is_whole_or_as_it_was(tmp_path):
     with whole_file(path) as file:
         file.write(b"after")
     assert path.read_text() == "after" and stat.S_IMODE(path.stat().st_mode) == 0o640
-
-
-def test_rows_are_whole_on_a_full_disk(tmp_path):
-    file = RowFile(tmp_path / "rows")
-    file.write("first\n")
-    with pytest.raises(OSError), disk_of(9):
-        file.write("second\n")
-    file.write("third\n")
-    file.close()
-    assert (tmp_path / "rows").read_text() == "first\nthird\n"
 
 
 def test_a_disk_that_fills_up_half_way(tmp_path, caplog):

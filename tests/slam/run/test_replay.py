@@ -12,7 +12,7 @@ from slam.calibration.posterior import RigPosterior
 from slam.config import SystemConfig
 from slam.data import FrameStatus
 from slam.errors import MeasurementError, SequenceError
-from slam.run.recording import load_recording, record, save_recording
+from slam.run.recording import RecordedFrame, Recording, load_recording, save_recording
 from slam.run.replay import replay
 from slam.system import StereoSlam
 
@@ -29,6 +29,10 @@ def recording(desk):
     return true_recording(desk)
 
 
+def recorded_of(results, system):
+    return Recording("desk", system.rig, system.config.models, tuple(map(RecordedFrame.of, results)))
+
+
 def online(results):
     return np.array([r.estimate.T_world_left for r in results])
 
@@ -39,7 +43,7 @@ def test_a_run_replayed_into_the_same_back_end_is_the_same_run(rig):
     config = SystemConfig.for_kind("handheld", None).with_settings(["models.pixel_sigma=0.5"])  # the world's
     system = StereoSlam(desk.rig, None, "ekf", config=config)
     results = [system.process_features(desk.observations(k)) for k in range(FRAMES)]
-    recorded = record(results, desk.rig, system.config.models, desk.name, desk.ground_truth)
+    recorded = recorded_of(results, system)
     again = list(replay(recorded, StereoSlam(desk.rig, None, "ekf", config=config).backend))
     # Not the last bit: the pose on which all agree was found there among more candidates.
     np.testing.assert_allclose(online(again), online(results), atol=1e-9)
@@ -50,8 +54,7 @@ def test_a_run_replayed_into_the_same_back_end_is_the_same_run(rig):
             np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
         np.testing.assert_array_equal(ours.report.used, theirs.report.used)
     assert again[0].status is FrameStatus.STARTED and again[-1].status is FrameStatus.TRACKED
-    twice = record(again, desk.rig, system.config.models)
-    require_same_frames(twice, recorded)
+    require_same_frames(recorded_of(again, system), recorded)
 
 
 def require_same_frames(one, other):
@@ -78,7 +81,7 @@ def test_what_was_mended_in_a_run_is_mended_in_its_replay(desk, tmp_path, monkey
         results.append(system.process_features(desk.observations(k)))
     revisions = [r.revision for r in results]
     assert [k for k, r in enumerate(revisions) if r is not None] == [8, 11]
-    save_recording(record(results, desk.rig, system.config.models), tmp_path / "run.npz")
+    save_recording(recorded_of(results, system), tmp_path / "run.npz")
     recorded = load_recording(tmp_path / "run.npz")
     backend, given = StereoSlam(desk.rig, None, "smoother").backend, []
     z = np.array([[200.0, 100.0, 180.0]])

@@ -73,6 +73,8 @@ def test_covariances_that_cannot_be_judged_say_so(nees):
     """A back end that claims the same covariance in every frame had no verdict, and no word why."""
     tree = summary(1.0) | {"consistency": {"mean NEES": nees, "dof": 6.0, "no covariance over 1 m": 1.0}}
     assert "cannot be judged" in verdict_of_run(tree) and "claims the same one for every frame" in verdict_of_run(tree)
+    singular = tree | {"consistency": tree["consistency"] | {"singular covariances": 4}}
+    assert verdict_of_run(singular).endswith("they are singular")
     assert "not judged in a prior map" in verdict_of_run(tree | {"loops": {"known": 5}})
     assert verdict_of_run(tree | {"consistency": {}}) == ""  # without a true path
 

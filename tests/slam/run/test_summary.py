@@ -72,4 +72,7 @@ def test_a_path_that_lacks_frames_is_said(caplog):
     record.measured, record.common = [True] * N, [CommonError()] * N
     record.milliseconds = [{}] * N
     results_of(SEQUENCE, SimpleNamespace(), record, path.select(np.arange(N - 3)), None)
-    assert "trajectory() lacks 3 of 120 frames" in caplog.text
+    assert "trajectory() lacks 3 of 120 frames" in caplog.text and "singular" not in caplog.text
+    record.covariances = [np.zeros((6, 6))] * N
+    results_of(SEQUENCE, SimpleNamespace(), record, path, None)
+    assert "singular covariance for 119 of 120 poses" in caplog.text

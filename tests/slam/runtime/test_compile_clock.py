@@ -2,35 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import subprocess
 import sys
-import time
 
 import pytest
-
-from slam.runtime import compilation
-from slam.runtime.compilation import compile_clock, working_time
-
-
-def test_a_kernel_that_is_compiled_is_noticed_once(caplog, monkeypatch):
-    monkeypatch.setattr(compilation, "_ROOMS", (__name__,))
-    caplog.set_level(logging.INFO, logger=compilation.__name__)
-    before, began = compile_clock.seconds(), working_time()
-    started = time.perf_counter()
-
-    def double(x):
-        return 2 * x
-
-    from numba import njit
-
-    for _ in range(2):
-        assert njit(double)(21) == 42
-    taken = time.perf_counter() - started
-    assert 0 < compile_clock.seconds() - before <= taken
-    assert working_time() - began < taken
-    assert len(caplog.messages) <= 1 and all("warm-up" in message for message in caplog.messages)
-
 
 WARM_UP = """
 import sys

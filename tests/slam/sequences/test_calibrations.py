@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,8 +13,6 @@ import pytest
 import slam
 from slam.errors import CalibrationError, ConfigurationError, SlamError
 from slam.sequences import open_sequence
-from slam.sequences.rigs import read_rig
-from tests.recordings import write_opencv
 
 SIZE = (64, 48)
 K = np.array([[50.0, 0, 31.5], [0, 51.0, 23.5], [0, 0, 1]])
@@ -160,13 +157,6 @@ def load(tmp_path: Path, name: str, encoding: str = "utf-8", **options) -> slam.
     return slam.load_rig(*(tmp_path / file for file in files), **known)
 
 
-def test_a_lens_of_one_camera_alone_is_refused(tmp_path: Path) -> None:
-    both = {"K1": M, "D1": [-0.3, 0.1, 0, 0], "K2": M, "R": EYE, "T": [-0.2, 0, 0]}
-    (tmp_path / "a.json").write_text(json.dumps(both))
-    with pytest.raises(CalibrationError, match="D2 is missing"):
-        slam.load_rig(tmp_path / "a.json", size=SIZE)
-
-
 @pytest.mark.parametrize("name", FORMS)
 def test_the_same_rig_in_the_words_of_many_programs_and_people(tmp_path: Path, name: str) -> None:
     _, options, distortion = FORMS[name]
@@ -216,6 +206,8 @@ def test_rectified_images_take_the_projection_matrices(tmp_path: Path, build: Si
     assert rig.is_rectified and rig.baseline == pytest.approx(np.linalg.norm(e["T"]), rel=1e-9)
     assert same(slam.load_rig(tmp_path / "p.yml", size=SIZE), rig)
     assert not slam.load_rig(tmp_path / "a.yml", size=SIZE).is_rectified
+    with pytest.raises(ConfigurationError, match=r"'fisheye' does nothing with .*p\.yml"):
+        slam.load_rig(tmp_path / "p.yml", size=SIZE, fisheye=True)
 
 
 def test_distortions_of_every_kind_and_length(tmp_path: Path, build: SimpleNamespace) -> None:
@@ -236,16 +228,6 @@ def test_distortions_of_every_kind_and_length(tmp_path: Path, build: SimpleNames
         slam.load_rig(file, size=SIZE)
 
 
-def test_a_written_calibration_is_of_the_images_as_recorded(tmp_path: Path) -> None:
-    camera = slam.StereoRig.from_pinhole([[50.0, 0, 20], [0, 50, 30], [0, 0, 1]], baseline=0.2, size=(48, 64)).left
-    camera = replace(camera, model="radtan", distortion=(0.1, 0.0, 0.01, 0.02))
-    rig = slam.StereoRig.side_by_side(camera, camera, np.eye(3), np.array([0.0, -0.2, 0.0]))
-    write_opencv(tmp_path / "c.yaml", rig)
-    again = read_rig([tmp_path / "c.yaml"], (48, 64), {})
-    assert again.turns == rig.turns == 1
-    assert again.left == rig.left and np.allclose(again.b, rig.b)
-
-
 # ------------------------------------------------------------------------------------------------ refused
 
 #: A file's text, or what is replaced in one of the forms, and what is said.
@@ -254,6 +236,7 @@ REFUSED = [
     ("fx: 0.8\nfy: 0.8\ncx: 0.5\ncy: 0.5\nbaseline: 0.2\n", "a focal length of 0.8 px for images 64 px wide: is it"),
     (f"{FIVE}baseline: 7.9\nunit: inch\n", "unit must be m or cm or mm, got 'inch'"),
     (f"{FIVE}baseline: -0.12\n", "fx, fy and baseline must be positive"),
+    (json.dumps({"K1": M, "D1": [-0.3, 0.1, 0, 0], "K2": M, "R": EYE, "T": [-0.2, 0, 0]}), "D2 is missing"),
     (OAK.replace('"toCameraSocket": 2', '"toCameraSocket": 0'), "depthai's, but says nothing of how the pair stands"),
     (ZED, "it is a ZED's, for images of another size than 64x48; it has 1280x720, 672x376"),
     ('{"rig": {}, "parameters": [], "evidence": null}', "errors of a rig, as `slam calibrate` or a run found them"),
@@ -312,11 +295,3 @@ def test_what_is_no_calibration_is_one_line(tmp_path: Path, two_folders: Path) -
         (tmp_path / f"{side}.yaml").write_text(ros_yaml(0))
     with pytest.raises(CalibrationError, match=r"right\.yaml: .*P of the right one holds no baseline"):
         slam.load_rig(tmp_path)
-
-
-def test_a_calibration_for_other_images_is_said_before_what_fails(two_folders: Path, build: SimpleNamespace) -> None:
-    K, D = np.array([[12.0, 0, 7], [0, 12, 5], [0, 0, 1]]), np.array([[-0.35, 0.15, 0, 0]])
-    entries = {"K1": K, "K2": K, "D1": D, "D2": D, "R": np.eye(3), "T": np.array([[-0.12], [0], [0]])}
-    build.write_storage(two_folders / "calibration.yaml", entries)
-    with pytest.raises(CalibrationError, match=r"\(7, 5\) px, .*the calibration is for images of about 14x10 px"):
-        slam.StereoSlam(open_sequence(f"{two_folders}?fps=10").rig)

@@ -22,7 +22,6 @@ from tests.bags import (
     D,
     K,
     compressed,
-    header,
     image,
     info,
     stereo,
@@ -235,13 +234,3 @@ def test_without_camera_messages_a_calibration_file_and_names_decide(tmp_path: P
     sequence = slam.open_sequence(f"{path}?calibration=five.yaml")
     assert sequence.rig.baseline == pytest.approx(0.2)
     assert seeds(sequence) == [(k, k + 10) for k in range(6)]
-
-
-def test_what_is_no_recording_is_one_line(tmp_path: Path) -> None:
-    for name, data in (("a.bag", b""), ("b.bag", b"#ROSBAG V1.2\n"), ("c.mcap", b"nonsense"), ("d.db3", b"nonsense")):
-        (tmp_path / name).write_bytes(data)
-        with pytest.raises(SequenceError, match=rf"{name}: cannot be read as a ROS recording"):
-            slam.open_sequence(tmp_path / name)
-    rows = [("/talk", "std_msgs/msg/Header", T0, header(STORES[1], T0))]
-    with pytest.raises(SequenceError, match="no images; its topics are /talk"):
-        slam.open_sequence(write(tmp_path / "talk.bag", rows))

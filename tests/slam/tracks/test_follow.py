@@ -65,17 +65,6 @@ def test_windows_are_the_innovations_ellipses(sigma):
     np.testing.assert_array_equal(inside[clear], (squared <= 25.0)[clear])
 
 
-def test_each_track_may_have_a_least_window_of_its_own():
-    cloud = Cloud()
-    features, ids = cloud.features(np.eye(4), 0.0)
-    least = np.where(np.arange(len(ids)) % 2, 5.0, 2.0)
-    looks, S = (cloud.descriptors[ids], cloud.laplacian[ids], features), np.tile(1e-6 * np.eye(2), (len(ids), 1, 1))
-    pixels = features.uv_left + np.array([0.0, 3.0])
-    pixels[1] = np.nan  # expected nowhere
-    matches = follow(pixels, S, *looks, Windows((3.0,), (0.4,), 0.8, 20.0, least))
-    assert matches.tracks.tolist() == list(range(3, len(ids), 2))
-
-
 def test_everywhere_keeps_to_the_pairs_that_are_allowed():
     cloud = Cloud()
     features, ids = cloud.features(np.eye(4), 0.0)
@@ -125,24 +114,13 @@ def test_tracks_that_look_alike_to_the_bit_share_a_feature():
     assert matches.tracks.tolist() == list(range(500)) and not matches.features.any()
 
 
-def test_ambiguous_features_are_left_alone():
+@pytest.mark.parametrize("change", ["ambiguous", "of the other sign", "nothing"])
+def test_what_cannot_be_matched_is_left_alone(change):
     cloud = Cloud(1)
     features, _ = cloud.features(np.eye(4), 0.0)
-    twice = features.select(np.array([0, 0]))
-    assert len(found(cloud, predicted(cloud, np.eye(4)), twice)) == 0
-
-
-def test_laplacian_signs_must_agree():
-    cloud = Cloud()
-    features, _ = cloud.features(np.eye(4), 0.0)
     flipped = replace(features, laplacian=(-features.laplacian).astype(np.int8))
-    assert len(found(cloud, predicted(cloud, np.eye(4)), flipped)) == 0
-
-
-def test_nothing_to_match():
-    cloud = Cloud()
-    nothing = StereoFeatures.empty(0.0, 32)
-    assert len(found(cloud, predicted(cloud, np.eye(4)), nothing)) == 0
-    assert len(match_everywhere(cloud.descriptors, cloud.laplacian, nothing, *WIDE)) == 0
-    features, _ = cloud.features(np.eye(4), 0.0)
+    ambiguous = features.select(np.array([0, 0]))
+    shown = {"ambiguous": ambiguous, "of the other sign": flipped, "nothing": StereoFeatures.empty(0.0, 32)}[change]
+    assert len(found(cloud, predicted(cloud, np.eye(4)), shown)) == 0
+    assert len(match_everywhere(cloud.descriptors, cloud.laplacian, shown, *WIDE)) == 0
     assert len(match_everywhere(cloud.descriptors[:0], cloud.laplacian[:0], features, *WIDE)) == 0

@@ -66,19 +66,6 @@ def test_other_places_wait_for_several_frames(far):
         assert found.kidnapped == (frame == AssociationConfig().kidnapped_after - 1)
 
 
-def test_places_are_not_asked_for_where_landmarks_are_found():
-    cloud = Cloud(150)
-    features, ids = cloud.features(np.eye(4), 0.0)
-    landmarks = LandmarkTable(np.arange(len(ids)), features.descriptors, features.laplacian)
-
-    def never() -> np.ndarray:
-        raise AssertionError
-
-    expected = prediction(cloud.points[ids], 0.01, 5.0)
-    found, _ = search(expected, landmarks, cloud.points[ids], features).localize(TrackingState(), never)
-    assert len(found) > 50
-
-
 @pytest.mark.parametrize(("shown", "frames"), [(60, 1), (2, AssociationConfig().kidnapped_after)])
 def test_few_landmarks_of_long_ago_count_when_several_frames_show_them(shown, frames):
     """A few out of many agree by chance with the pose that all others give, as if the path had no drift."""

@@ -13,7 +13,6 @@ from slam.geometry import se3
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from slam.tracks.config import MapConfig
-from slam.tracks.step import TrackingState
 from tests.slam.scene import RIG, Cloud, path
 
 BACKENDS = ("ekf", "smoother", "window")
@@ -100,12 +99,3 @@ def test_a_shaken_camera_with_sharp_images_is_tracked(backend):
         errors = np.linalg.norm(system.trajectory().positions - np.array(poses)[:, :3, 3], axis=1)
         largest.append(errors.max())
     assert np.median(largest) < 0.03
-
-
-def test_what_counts_as_lost():
-    steps = [TrackingState()]
-    for vague, features in ((False, 50), (False, 50), (False, 0), (True, 50), (True, 50)):
-        steps.append(steps[-1].after(False, False, vague, features, lost_after=3))
-    assert [s.lost for s in steps] == [False, False, False, False, True, True]
-    assert [s.may_add(4) for s in steps] == [True, False, False, False, False, True]
-    assert vars(steps[-1].after(True, False, True, 50, 3)) == vars(TrackingState())

@@ -49,7 +49,8 @@ def test_a_frame_s_copy_has_room_and_leaves_the_landmarks_of_the_frame_before_as
     before = tracks.landmarks()
     step = tracks.begun(40, 4)
     assert (~step.used).sum() >= 40 and not step.found.any()
-    step.count_frame(3, np.array([0, 1]), np.array([1]), features(2), np.array([1]))
+    step.renew(np.array([1]), features(3), np.array([2]), 0.5, HERE + 1, 0)
+    step.seen[1] += 1
     step.erase_landmarks(np.array([0]))
     after = tracks.landmarks()
     for name in LandmarkTable.__dataclass_fields__:

@@ -47,9 +47,19 @@ def test_whitened_residuals_have_unit_covariance():
     problem = PoseProblem(stereo, np.ones((50, 3)), np.ones((50, 3)), S, np.eye(4), np.eye(6), 0.99)
     W = problem.whiteners
     np.testing.assert_allclose(W @ S @ np.swapaxes(W, 1, 2), np.broadcast_to(np.eye(3), S.shape), atol=1e-9)
-    S[7] *= -1
-    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
-        _ = replace(problem, noise=S).whiteners
+
+
+def test_a_landmark_of_which_too_little_is_known_does_not_take_part_and_fails_nothing():
+    stereo, rng = RectifiedStereo.of(RIG), np.random.default_rng(4)
+    points = rng.uniform([-1, -1, 3], [1, 1, 5], (20, 3))
+    noise = np.repeat(np.eye(3)[None], 20, axis=0)
+    d = np.array([1.0, 0.7, 0.3])
+    noise[7] = 1e18 * np.outer(d, d) - np.eye(3)  # what rounding leaves of a variance of 1e18 along one line
+    problem = PoseProblem(stereo, points, stereo.project(points)[0], noise, np.eye(4), np.eye(6), 0.99)
+    T, used = solve(problem, np.eye(4))
+    np.testing.assert_allclose(T, np.eye(4), atol=1e-9)
+    assert used.sum() == 19 and not used[7]
+    assert np.isinf(problem.distances(T)[7])
 
 
 def test_a_left_pixel_alone_is_gated_with_two_degrees_of_freedom():

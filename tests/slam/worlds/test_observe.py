@@ -16,7 +16,7 @@ def residuals(query: str, frames: int = 38) -> tuple[np.ndarray, np.ndarray]:
     for k in range(0, 40 * frames, 40):
         seen, truth = sequence.simulate(k), visible_landmarks(sequence.world, k)
         rows = np.searchsorted(truth.ids, seen.ids)
-        stereo = seen.features.has_stereo & truth.in_right[rows]
+        stereo = seen.features.has_stereo & np.isfinite(truth.uv_right[rows, 0])
         f, rows = seen.features, rows[stereo]
         left, right = f.uv_left[stereo], f.uv_right[stereo]
         errors.append(np.column_stack([left - truth.uv_left[rows], right[:, 0] - truth.uv_right[rows, 0]]))

@@ -11,9 +11,9 @@ from slam.errors import SlamError
     ("text", "message"),
     [
         ("isle", r"unknown world 'isle' \(did you mean 'aisle'\?\); known: aisle, box, boxes"),
-        ("aisle?sead=3", r"world 'aisle' has no option 'sead' \(did you mean 'seed'\?\); known: baseline, .*seed"),
-        ("aisle?frames=many", "frames must be a whole number, got 'many'"),
-        ("aisle?sigma=nan", "sigma must lie in"),
+        ("aisle?sead=3", r"world aisle: unknown option 'sead' \(did you mean 'seed'\?\); known: baseline, .*seed"),
+        ("aisle?frames=many", "frames must be a whole number from 1 to 1000000, got 'many'"),
+        ("aisle?sigma=nan", "sigma must be a number from 0 to 100, got 'nan'"),
         ("aisle?seed=1&seed=2", "'seed' is given twice"),
         ("aisle?black=often", "black must be frames"),
         ("aisle?drop=0:2000", "no frame is left"),

@@ -5,10 +5,7 @@ import numpy as np
 import pytest
 
 from slam.worlds import open_world
-from slam.worlds.geometry import RectangleArrays, rectangle
 from slam.worlds.observe import visible_landmarks
-from slam.worlds.raster import View, place, shown
-from slam.worlds.surfaces import Material
 
 
 def saddle(image: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -57,16 +54,6 @@ def test_corners_are_drawn_where_they_project_in_both_images(board_world, rig, s
     assert np.abs(errors.mean(axis=0)).max() < 0.01
     assert np.median(distance) < 0.02
     assert distance.max() < 0.05
-
-
-def test_surfaces_that_reach_through_each_other_are_told_apart_by_depth():
-    wall = Material(2.0, 2.0, "plaster", 0)
-    crossing = [rectangle(wall, (-1, 2 - d, 1), (1, d, 0), (0, 0, -1)) for d in (0.5, -0.5)]
-    view = View(np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), 101, 101)
-    looking_along_y = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-    placed = place(RectangleArrays.of(crossing), np.eye(4)[None], looking_along_y, view)
-    labels = placed.source[shown(placed, view)[50].astype(int) - 1]
-    assert (labels[10:45] == 0).all() and (labels[55:90] == 1).all(), "each is nearer on one side"
 
 
 def test_detail_finer_than_pixels_leaves_no_pattern(board_world):

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from slam.geometry.se3 import inverse, rotation_angle
 from slam.sequences import Sequence, open_sequence
@@ -49,15 +50,6 @@ def test_box_stands_at_the_places_of_table_1():
     for i, (x, y, z, yaw, pitch, roll) in enumerate(indoors.PLACES):
         T = sequence.objects(i * pause + 30)[0]
         assert np.allclose(T[:3, 3], (x, y, z), atol=1e-12)
-        a, b, c = np.deg2rad([yaw, pitch, roll])
-        R = _about(2, a) @ _about(1, b) @ _about(0, c)
+        R = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix()
         assert np.allclose(T[:3, :3], R, atol=1e-12)
         assert np.array_equal(T, sequence.objects(i * pause + 31)[0]), "it stands still there"
-
-
-def _about(axis: int, angle: float) -> np.ndarray:
-    R = np.eye(3)
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    R[[i, j], [i, j]] = np.cos(angle)
-    R[i, j], R[j, i] = -np.sin(angle), np.sin(angle)
-    return R
