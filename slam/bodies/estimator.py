@@ -188,7 +188,7 @@ class BodyEstimator:
         for again in range(_SOLVED_AGAIN + 1):
             if used.sum() < enough:
                 return None, ids[:0], ids
-            tried = replace(b, rows=b.rows.joined(self._rows(len(b) - 1, rows[used], z[used])))
+            tried = replace(b, rows=b.rows.joined(Rows.of(len(b) - 1, rows[used], z[used], self.sigma)))
             solution = solve(window(tried, self.stereo, motion))
             local, _ = solution.point_covariances(len(b) - 1)
             distances = solution.left_out_distances(-1, rows[used], z[used], local[rows[used]], self.sigma)
@@ -250,11 +250,8 @@ class BodyEstimator:
         at = len(ids) + np.arange(len(which))
         points = replace(b.points, ids=ids).joined(new_points)
         return replace(
-            b, points=points, rows=b.rows.joined(self._rows(len(b) - 1, at, seen.z[which]))
+            b, points=points, rows=b.rows.joined(Rows.of(len(b) - 1, at, seen.z[which], self.sigma))
         ), which  # fmt: skip
-
-    def _rows(self, frame: int, points: IndexArray, z: Array) -> Rows:
-        return Rows.of(frame, points, z, self.sigma)
 
     def _reported(
         self, b: BodyBelief, id: int, cameras: RecentPoses, measured: bool, used: IdArray, rejected: IdArray
