@@ -81,7 +81,7 @@ class ObjectModels:
         max_speed, max_acceleration, max_turn_rate: limits of any body's motion [m/s], [m/s²], [rad/s]; an estimate
             beyond them is refused. The acceleration is that of a collision.
         drift: density of the random walk of a feature's pixel, in both images alike, with the angle from which it is
-            seen [px / √rad]: from another viewpoint it is at another point of a still surface, which seems to move.
+            seen [px / √rad]: from another viewpoint it is at another point of the surface, of the world or of a body.
 
     Raises:
         ConfigurationError: a number is not positive and finite, or fewer than three points are allowed.

@@ -65,6 +65,7 @@ def when_missed(probability: float, seen: int, age: int) -> float:
 
 
 _EXACT = 1e-12 * np.eye(6)  # numerics: [rad², m²]
+_TURN = 0.01  # cost: a point is seen from elsewhere by no less [rad]; what is less adds up
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,12 +77,14 @@ class Points(Table):
     local: Array  # covariance (N, 3, 3) [m²] in the coordinates of the newest camera, by which they are known
     failures: IdArray  # how often running each was rejected (N,)
     unseen: IdArray  # frames since each was seen (N,)
+    first: Array  # direction (N, 3) from which each was seen first, in body coordinates
+    turned: Array  # largest angle between that and later ones (N,) [rad], as far as it is allowed for
 
     @classmethod
-    def new(cls, ids: IdArray, position: Array, local: Array) -> Points:
-        """Points at their first sight."""
+    def new(cls, ids: IdArray, position: Array, local: Array, eye: Array) -> Points:
+        """Points at their first sight, from `eye` (3,)."""
         none = np.zeros(len(ids), np.int64)
-        return cls(ids, position, local, none, none)
+        return cls(ids, position, local, none, none, _directions(position, eye), np.zeros(len(ids)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,10 +114,16 @@ class BodyBelief:
         return np.asarray(self.points.ids >= 0)
 
 
+def _directions(points: Array, eye: Array) -> Array:
+    """Unit vectors (N, 3) from points (N, 3) towards the camera's place (3,)."""
+    d = eye - points
+    return np.asarray(d / np.linalg.norm(d, axis=1)[:, None])
+
+
 def begun(stamp: float, T_body_left: Array, velocity: Array, sigmas: Array, estimate: ObjectEstimate) -> BodyBelief:
     """A belief without points: the body's frame is put at T_body_left (4, 4) from the camera, by definition."""
     none = np.zeros((0, 3))
-    points = Points.new(np.zeros(0, np.int64), none, np.zeros((0, 3, 3)))
+    points = Points.new(np.zeros(0, np.int64), none, np.zeros((0, 3, 3)), np.zeros(3))
     return BodyBelief(
         stamp, estimate.T_world_object, velocity, sigmas, np.array([stamp]), T_body_left[None], np.ones(1),
         points, Rows.none(), RelativePrior.of_pose(T_body_left, _EXACT), _EXACT, estimate,
@@ -150,10 +159,11 @@ def window(b: BodyBelief, stereo: RectifiedStereo, motion: Motion) -> Window:
     return Window(stereo, b.poses, b.points.position, b.rows, motion=motion, prior=b.prior)
 
 
-def slid(b: BodyBelief, stereo: RectifiedStereo, motion: Motion) -> BodyBelief:
+def slid(b: BodyBelief, stereo: RectifiedStereo, motion: Motion, drift: float) -> BodyBelief:
     """The belief without its oldest frame, which becomes part of the prior with the points that it has measured.
 
-    Raises LinAlgError where the information of what leaves is not positive definite.
+    `drift` is the density of the random walk of a point's direction with the angle of view [rad / √rad]. Raises
+    LinAlgError where the information of what leaves is not positive definite.
     """
     rows, member, here = b.rows, np.zeros(len(b.points), bool), np.zeros(len(b.points), bool)
     member[b.prior.points], here[rows.point[rows.pose == 0]] = True, True
@@ -162,11 +172,37 @@ def slid(b: BodyBelief, stereo: RectifiedStereo, motion: Motion) -> BodyBelief:
     w = window(b, stereo, motion.select(np.flatnonzero((motion.poses <= 0).any(axis=1))))
     w = replace(w, rows=rows.select(taken), joining=np.flatnonzero(joins))
     prior, _, _ = marginalised(w, [0], ends[b.prior.points])
+    prior, turned = _drifted(prior, b, drift)
     rows, keep = rows.select(~taken & (rows.pose > 0)), member & b.alive | joins
     keep[rows.point] = True
     index = np.cumsum(keep) - 1
     return replace(
-        b, stamps=b.stamps[1:], poses=b.poses[1:], scales=b.scales[1:], points=b.points.select(keep),
+        b, stamps=b.stamps[1:], poses=b.poses[1:], scales=b.scales[1:],
+        points=replace(b.points, turned=turned).select(keep),
         rows=replace(rows, pose=rows.pose - 1, point=index[rows.point]),
         prior=replace(prior, points=index[prior.points]), covariance=b.covariance[6:, 6:],
     )  # fmt: skip
+
+
+def _drifted(prior: RelativePrior, b: BodyBelief, density: float) -> tuple[RelativePrior, Array]:
+    """The prior with its points less certain across the line of sight, and the angles (N,) allowed for now.
+
+    A feature is found where the image looks like it; seen from farther round than ever before, that is elsewhere on the
+    body. The first two coordinates of a point in its chart are its direction.
+    """
+    p = b.points
+    cosine = np.einsum("ni,ni->n", p.first, _directions(p.position, b.poses[-1][:3, 3]))
+    turned = np.maximum(p.turned, np.arccos(np.clip(cosine, -1, 1)))
+    more = (turned - p.turned)[prior.points]
+    far = np.flatnonzero(more > _TURN)
+    if not len(far) or not density:
+        return prior, p.turned
+    out = p.turned.copy()
+    out[prior.points[far]] = turned[prior.points[far]]
+    at = (3 * far[:, None] + np.arange(2)).reshape(-1)
+    S = np.diag(1.0 / np.repeat(density**2 * more[far], 2)) + prior.information[np.ix_(at, at)]
+    gain = np.linalg.solve(S, prior.information[at]).T
+    information = prior.information - gain @ prior.information[at]
+    return replace(
+        prior, information=0.5 * (information + information.T), vector=prior.vector - gain @ prior.vector[at]
+    ), out

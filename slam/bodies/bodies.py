@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.bodies.belief import EVEN, BodyBelief, when_measured, when_missed
-from slam.bodies.config import MIN_FRAMES
+from slam.bodies.config import CLEAR, MIN_FRAMES
 from slam.bodies.track_kernels import windows_in_body
 from slam.data import BoolArray
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, so3_exp, transform
@@ -22,7 +22,6 @@ from slam.tracks.table import Tracks
 _UNMEASURED = 1.0  # [s] for which a body is still reported after its last measurement
 UNMEASURED_SHARE = 0.05  #: most frames in which it is so, as a share of those in which it was measured
 PROOF = 4  #: by frames that are certain by both tests, each of which counts twice, or by way and turn together
-CLEAR = 6.0  #: χ² by which a track says for certain whose it is: 20 to 1
 SOLID = 0.6  #: share of the points inside a body that go with it: where others stand still, a shadow or leaves move
 CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]

@@ -9,7 +9,6 @@ import numpy as np
 
 from slam.bodies import finder, membership
 from slam.bodies.bodies import (
-    CLEAR,
     Body,
     advanced,
     continued,
@@ -20,10 +19,10 @@ from slam.bodies.bodies import (
     with_evidence,
     with_extent,
 )
-from slam.bodies.config import MIN_FRAMES, RUN, WINDOW, ObjectsConfig
+from slam.bodies.config import CLEAR, MIN_FRAMES, RUN, WINDOW, ObjectsConfig
 from slam.bodies.estimator import FRAMES, BodyEstimator
 from slam.bodies.finder import Scene, parting
-from slam.bodies.fits import fit_positions, fit_velocities, make_room, record, revise_tracks
+from slam.bodies.fits import fit_positions, fit_velocities, record, revise_tracks
 from slam.bodies.following import follow, located, observed
 from slam.bodies.frame import NO_IDS, Frame, Setup, recent_poses, with_estimate
 from slam.bodies.membership import merge
@@ -195,7 +194,8 @@ class MovingObjectDetector(ObjectDetector):
             self.bodies[body.id] = body
             mine = np.flatnonzero(tracks.body == body.id)
             tracks.position[mine] = transform(body.T, tracks.local[mine])
-        make_room(tracks, frame.slot)
+        for column in (tracks.A, tracks.p, tracks.dof):  # what the slot held leaves the window
+            column[:, frame.slot] = 0
         self._record(tracks, np.flatnonzero(tracks.found), frame)
 
     def _record(self, tracks: Tracks, rows: IndexArray, frame: Frame) -> None:

@@ -113,7 +113,7 @@ class BodyEstimator:
         cameras = _of(cameras, np.append(b.stamps, cameras.stamps[-1]))
         earlier = _of(cameras, b.stamps)
         if len(b) >= FRAMES:
-            b = slid(b, self.stereo, carried(b, earlier, self.models))
+            b = slid(b, self.stereo, carried(b, earlier, self.models), self.models.drift / self.stereo.f)
             cameras, earlier = _of(cameras, cameras.stamps[1:]), _of(cameras, b.stamps)
         expected = self._expected(b, cameras)
         rejected = none = np.zeros(0, np.int64)
@@ -188,7 +188,7 @@ class BodyEstimator:
         for again in range(_SOLVED_AGAIN + 1):
             if used.sum() < enough:
                 return None, ids[:0], ids
-            tried = replace(b, rows=b.rows.joined(self._rows(len(b) - 1, rows[used], z[used])))
+            tried = replace(b, rows=b.rows.joined(Rows.of(len(b) - 1, rows[used], z[used], self.sigma)))
             solution = solve(window(tried, self.stereo, motion))
             local, _ = solution.point_covariances(len(b) - 1)
             distances = solution.left_out_distances(-1, rows[used], z[used], local[rows[used]], self.sigma)
@@ -246,15 +246,12 @@ class BodyEstimator:
         ids[gone] = -1
         h = seen.local[which]
         own = self.stereo.rig.triangulation_covariance(h, self.sigma)
-        new_points = Points.new(seen.given.points[which], transform(b.poses[-1], h), own)
+        new_points = Points.new(seen.given.points[which], transform(b.poses[-1], h), own, b.poses[-1][:3, 3])
         at = len(ids) + np.arange(len(which))
         points = replace(b.points, ids=ids).joined(new_points)
         return replace(
-            b, points=points, rows=b.rows.joined(self._rows(len(b) - 1, at, seen.z[which]))
+            b, points=points, rows=b.rows.joined(Rows.of(len(b) - 1, at, seen.z[which], self.sigma))
         ), which  # fmt: skip
-
-    def _rows(self, frame: int, points: IndexArray, z: Array) -> Rows:
-        return Rows.of(frame, points, z, self.sigma)
 
     def _reported(
         self, b: BodyBelief, id: int, cameras: RecentPoses, measured: bool, used: IdArray, rejected: IdArray

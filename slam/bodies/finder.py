@@ -34,7 +34,7 @@ from slam.bodies import membership
 from slam.bodies import scene_kernels as kernels
 from slam.bodies.belief import compact
 from slam.bodies.bodies import Body, in_body_axes, new_body
-from slam.bodies.config import MIN_FRAMES, MIN_POINTS, RUN, WINDOW
+from slam.bodies.config import MIN_FRAMES, MIN_POINTS, ROUNDS, RUN, WINDOW
 from slam.bodies.fits import constant_velocity, fit_velocities, measure, times_vectors
 from slam.bodies.frame import Frame, Setup
 from slam.bodies.regions import Region
@@ -53,7 +53,6 @@ _UPPER_QUARTILE = chi_square_limit(3, 0.75)  # of χ²(3)
 _SIZES = np.array([[0.1, 0.1, 0.2], [0.2, 0.2, 0.4], [0.4, 0.4, 0.8]])  # of windows: x/z, y/z, logarithm of the depth
 _HALVES = 0.5 * np.array(list(product((0, 1), repeat=3)))  # of a width, by which windows of a size are apart
 _CELLS = 2**12  # numerics: more than there are windows along an axis
-_ROUNDS = 3  # of leaving out what rather stands still, and fitting again
 # 0.1: from 0.25 on a box that starts carries the camera along
 _PRECISE = 0.1  # times the noise of a pixel: what it is from frame to frame at least, without what lasts
 
@@ -258,7 +257,7 @@ class MovingGroup:
 def moving_group(frame: Frame, tracks: Tracks, members: IndexArray) -> MovingGroup | None:
     """Those of the tracks `members` (K,) that lie together and move alike; None if they are too few or too far."""
     members = members[compact(tracks.position[members])]
-    for _ in range(_ROUNDS + 1):
+    for _ in range(ROUNDS + 1):
         if len(members) < MIN_POINTS:
             return None
         group = _with_common_twist(frame, tracks, members)

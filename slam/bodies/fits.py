@@ -16,9 +16,7 @@ from slam.tracks.table import Tracks
 
 _TOO_FAR = 3.0  # expected points so far off that linearising there is worse than at the measured point [px]
 _STEPS = 4  # numerics: of Gauss-Newton at most
-MOVES = 12.0  #: derived: χ²(3) at 99.3 % of the velocity, from which it counts
-AGREES = 11.3  #: derived: χ²(3) at 99 %, of places or velocities that are the same
-EXPLAINED = 0.2  #: share of the χ² of "still" that a motion, itself uncertain, may leave of what moves with it
+AGREES = 12.0  #: derived: χ²(3) at 99.3 %, of places or velocities that are the same; a velocity counts from it on
 
 
 def measure(rig: StereoRig, T_world_left: Array, points: Array, measured: Array, sigma: float) -> tuple:
@@ -32,17 +30,11 @@ def measure(rig: StereoRig, T_world_left: Array, points: Array, measured: Array,
     return found
 
 
-def make_room(tracks: Tracks, slot: int) -> None:
-    """Let what `slot` held leave the window, in place."""
-    for column in (tracks.A, tracks.p, tracks.dof):
-        column[:, slot] = 0
-
-
 def record(
     tracks: Tracks, rows: IndexArray, slot: int, rig: StereoRig, T_world_left: Array, features: StereoFeatures,
     sigma: float,
 ) -> None:  # fmt: skip
-    """Enter what the features of tracks (K,) measure in this frame, in place; see `make_room`."""
+    """Enter what the features of tracks (K,) measure in this frame, in place."""
     z = measurement_rows(features.uv_left[tracks.row[rows]], features.uv_right[tracks.row[rows]])
     points, tracks.A[rows, slot], tracks.dof[rows, slot] = measure(rig, T_world_left, tracks.position[rows], z, sigma)
     tracks.p[rows, slot] = points - tracks.anchor[rows]
@@ -78,7 +70,7 @@ def constant_velocity(tracks: Tracks, rows: IndexArray, times: Array, max_speed:
 def fit_velocities(tracks: Tracks, rows: IndexArray, times: Array, max_speed: float) -> None:
     """Give tracks a velocity, in place, where a fixed point does not explain them; see `constant_velocity`."""
     m = constant_velocity(tracks, rows, times, max_speed)
-    moves = m.test > MOVES
+    moves = m.test > AGREES
     moving = rows[moves]
     tracks.velocity[moving], tracks.velocity_covariance[moving] = m.velocity[moves], m.velocity_covariance[moves]
     tracks.position[moving], tracks.covariance[moving] = m.position[moves], m.covariance[moves]

@@ -13,9 +13,9 @@ from functools import cache
 
 import numpy as np
 
-from slam.bodies.bodies import CLEAR, Body, in_body_axes, spread_of_place, with_extent
-from slam.bodies.config import MIN_FRAMES, RUN, WINDOW
-from slam.bodies.fits import EXPLAINED, fit_positions, times_vectors
+from slam.bodies.bodies import Body, in_body_axes, spread_of_place, with_extent
+from slam.bodies.config import CLEAR, EXPLAINED, MIN_FRAMES, ROUNDS, RUN, WINDOW
+from slam.bodies.fits import fit_positions, times_vectors
 from slam.bodies.frame import Frame
 from slam.bodies.track_kernels import LEAST, RIDGE, inverses, squares, weighted_means
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
@@ -25,9 +25,7 @@ from slam.tracks.table import Tracks
 
 MARGIN = 0.25  # how far from a body's extent its further features may lie, as a share of the extent's diagonal
 _MOST_POINTS = 80  # cost: members of a body
-_ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]
-_MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of both diagonals
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join
 _LOOSE = 4.0  # times the 99 % limit that the χ² of a member may be whose motion is explained for the most part
 _MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
@@ -63,7 +61,7 @@ def fitted(body: Body, tracks: Tracks, rows: IndexArray, slot: int) -> Body:
 
 def _with_poses_fitted(body: Body, tracks: Tracks, rows: IndexArray) -> Body:
     """A body with its poses over the window fitted to what tracks measured."""
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         points, A, _ = in_body_axes(body, tracks, rows)
         y = weighted_means(points, A)
         J = -points_by_pose(y)
@@ -298,7 +296,7 @@ def _apart(body: Body, mine: IndexArray, other: Body, theirs: IndexArray, tracks
     """
     part, larger = other.id == body.apart_from, len(theirs) >= len(mine)
     whole, few, rows = (other, body, mine) if larger else (body, other, theirs)
-    near = _distances(whole, tracks, rows, _MERGED * (1.0 + few.across / whole.across)) < _NEAR
+    near = _distances(whole, tracks, rows, 2.0 * MARGIN * (1.0 + few.across / whole.across)) < _NEAR
     beside = 2 * near.sum() > len(rows)
     explained = beside and _explained(whole, tracks, rows) < 2 * EXPLAINED
     if explained and larger and not part and body.seen <= WINDOW:

@@ -73,7 +73,7 @@ def test_nees(scene_of):
 def test_agrees_with_a_dense_solution_of_all_frames():
     """Poses and points of all frames at once, by scipy, with a known camera: what is marginalised loses nothing."""
     scene = box_scene(seed=3, frames=7, moving=False, points=8)
-    stereo, models = RectifiedStereo.of(scene.rig), replace(scene.models.objects)
+    stereo, models = RectifiedStereo.of(scene.rig), replace(scene.models.objects, drift=0.0)
     rng, estimator = np.random.default_rng(5), BodyEstimator(scene.rig, replace(scene.models, objects=models))
     first = se3.pose(np.eye(3), scene.points.mean(axis=0))
     belief, z = None, []
@@ -221,9 +221,23 @@ def test_a_point_that_was_given_up_leaves_with_all_its_measurements():
     ids = b.points.ids.copy()
     ids[member] = -1
     given_up = replace(b, points=replace(b.points, ids=ids))
-    after = slid(given_up, RectifiedStereo.of(scene_.rig), Motion.none())
+    after = slid(given_up, RectifiedStereo.of(scene_.rig), Motion.none(), 0.0)
     assert b.points.ids[member] not in after.points.ids
-    assert len(after.points) == len(slid(b, RectifiedStereo.of(scene_.rig), Motion.none()).points) - 1
+    assert len(after.points) == len(slid(b, RectifiedStereo.of(scene_.rig), Motion.none(), 0.0).points) - 1
+
+
+def test_a_point_seen_from_farther_round_is_less_certain_across():
+    """Its feature slides; `drift` is the density of that, and the angle counts once."""
+    scene, drift = box_scene(0, FRAMES + 3, still=True), 1e-3
+    *_, (_, b, _) = follow("ekf", scene)
+    away = se3.so3_exp(np.array([0, 0.3, 0]))
+    turned = replace(b, points=replace(b.points, first=b.points.first @ away.T, turned=np.zeros(len(b.points))))
+    before, after = (slid(turned, RectifiedStereo.of(scene.rig), Motion.none(), d) for d in (0.0, drift))
+    known, less, angles = before.prior.information, after.prior.information, after.points.turned[after.prior.points]
+    assert np.median(angles) == pytest.approx(0.3, abs=0.05) and not before.points.turned.any()
+    more = np.zeros(len(known))  # variance, of directions alone
+    more[: 3 * len(angles)] = drift**2 * np.repeat(angles, 3) * np.tile([1.0, 1.0, 0.0], len(angles))
+    np.testing.assert_allclose(less @ (np.eye(len(known)) + np.diag(more) @ known), known, atol=1e-6 * known.max())
 
 
 def test_too_few_points_begin_no_body():

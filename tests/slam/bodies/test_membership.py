@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from slam.bodies import membership
-from slam.bodies.bodies import CLEAR, PROOF, Body, continued, new_body, with_evidence, with_extent
-from slam.bodies.config import ObjectsConfig
+from slam.bodies.bodies import PROOF, Body, continued, new_body, with_evidence, with_extent
+from slam.bodies.config import CLEAR, ObjectsConfig
 from slam.bodies.fits import fit_positions
 from slam.bodies.membership import merge
 from slam.data import StereoFeatures

@@ -9,7 +9,7 @@ import slam
 from frontends import create
 from slam.bodies.config import WINDOW, ObjectsConfig
 from slam.bodies.detector import MovingObjectDetector
-from slam.bodies.fits import fit_positions, make_room, record
+from slam.bodies.fits import fit_positions, record
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry.se3 import exp, inverse, log
@@ -57,7 +57,6 @@ class Room:
         tracks.ids[:] = tracks.row[:] = self.ids
         tracks.begin(self.ids, self.ids, features_at(np.zeros((count, 3))), self.points)
         for frame in range(frames):
-            make_room(tracks, frame)
             known = self.ids[(self.ids != near - 1) | (frame > frames - 3)]
             record(tracks, known, frame, RIG, IDENTITY, features_at(seen(self.points, rng)), 1.0)
         fit_positions(tracks, self.ids)
