@@ -1,7 +1,8 @@
 """The maximum-likelihood estimate from all measurements, by Levenberg-Marquardt: the reference for back ends.
 
-Every frame and every landmark is a variable, every accepted measurement a factor of its own, and the motion model ties
-three successive frames; nothing is approximated.
+Every frame is a variable, every landmark that its measurements determine, and every measurement of one that the
+smoother accepted a factor of its own; the motion model ties three successive frames. Left out are landmarks that were
+seen once, with a disparity below a pixel, and what was before a restart.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
-from backends.smoother.graph import FAILURES, line, minimised
+from backends.smoother.graph import SolverError, minimised, solving
 from backends.smoother.state import SmootherState
 from backends.smoother.tracks import GraphProblem, Tracks
 from slam.data import Estimate
@@ -114,7 +115,7 @@ class _BatchSolution:
             for i, number in enumerate(hangs.tolist())
         ]
         problem, tracks = GraphProblem(), Tracks(make, None)
-        problem.factors.add(make.prior(s.begun, s.poses[s.of(s.begun)], s.prior))
+        problem.factors.add(make.prior(s.begun, s.start, s.prior))
         tracks.add_pose(problem, s, s.begun, s.begun)
         for key, T in zip(keys[1:], before[1:]):
             problem.values.insert(key, to_pose3(T))
@@ -153,11 +154,10 @@ class _BatchSolution:
     @cached_property
     def _marginals(self) -> gtsam.Marginals | None:
         try:
-            return gtsam.Marginals(self._factors, self.values)
-        except FAILURES as error:
-            logging.getLogger(__name__).warning(
-                "batch: covariances are the smoother's, gtsam gives none: %s", line(error)
-            )
+            with solving():
+                return gtsam.Marginals(self._factors, self.values)
+        except SolverError as error:
+            logging.getLogger(__name__).warning("batch: covariances are the smoother's, gtsam gives none: %s", error)
             return None
 
     def covariance(self, key: int, otherwise: Array) -> Array:
@@ -165,8 +165,9 @@ class _BatchSolution:
         if self._marginals is None:
             return otherwise
         try:
-            return np.asarray(self._marginals.marginalCovariance(key))
-        except FAILURES:
+            with solving():
+                return np.asarray(self._marginals.marginalCovariance(key))
+        except SolverError:
             return otherwise
 
 

@@ -13,11 +13,11 @@ import os
 import secrets
 import stat
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -128,6 +128,34 @@ def array(data: bytes, name: str, source: str, error: type[SlamError] = SlamErro
         return np.asarray(found, order="C")
     except Exception as fault:  # likewise
         raise error(f"{source}: {name} cannot be read as an array: {_text(fault)}") from fault
+
+
+class Kind(NamedTuple):
+    """What an array of a file must be."""
+
+    dtype: type  # of its entries
+    shape: str  # a letter for each size that other arrays share, a figure for each that is fixed
+    least: float  # bounds of its entries
+    most: float
+    what: str = ""  # "unknown" where entries may be NaN; else for whoever reads the file
+    field: str = ""  # likewise: the attribute that it holds
+
+
+def require_arrays(
+    arrays: Mapping[str, Any], kinds: Mapping[str, Kind], source: str, error: type[SlamError] = SlamError
+) -> None:
+    """Raise `error` where an array is not of its kind, or sizes that should be equal are not."""
+    sizes: dict[str, int] = {}
+    for name, kind in kinds.items():
+        a = arrays[name]
+        if not isinstance(a, np.ndarray) or a.dtype != kind.dtype or a.ndim != len(kind.shape):
+            raise error(f"{source}: {name} must be of {np.dtype(kind.dtype)}, with {len(kind.shape)} dimensions")
+        fits = [sizes.setdefault(c, n) == n if c.isalpha() else int(c) == n for c, n in zip(kind.shape, a.shape)]
+        if not (fits[0] if not len(a) else all(fits)):  # of no rows the others may be anything
+            raise error(f"{source}: {name} has the shape {a.shape}, which does not fit the other arrays")
+        good = (kind.least <= a) & (a <= kind.most)
+        if not (good | np.isnan(a) if kind.what == "unknown" else good).all():
+            raise error(f"{source}: {name} holds an impossible number")
 
 
 def json_text(text: str | bytes, source: str, error: type[SlamError] = SlamError) -> Any:

@@ -12,7 +12,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from slam.sequences.ros_bag import COMPRESSED, INFO, RAW
-from tests.recordings import HEIGHT, WIDTH, picture
+from tests.recordings import HEIGHT, WIDTH, K, picture
 
 T0 = 1_700_000_000_000_000_000
 STEP = 50_000_000
@@ -40,7 +40,6 @@ def compressed(store, stamp: int, message):
     return store.types[COMPRESSED](header(store, stamp), "png", data)
 
 
-K = np.array([[50.0, 0, 31.5], [0, 51.0, 23.5], [0, 0, 1]])
 D = np.array([-0.2, 0.05, 0.001, -0.001, 0.0])
 R_LEFT = cv2.Rodrigues(np.array([0.01, -0.02, 0.005]))[0]
 R_RIGHT = cv2.Rodrigues(np.array([-0.01, 0.01, 0.003]))[0]

@@ -11,6 +11,9 @@ from slam.geometry.rig import StereoRig
 
 WIDTH, HEIGHT = 64, 48
 
+#: Of the left camera.
+K = np.array([[50.0, 0, 31.5], [0, 51.0, 23.5], [0, 0, 1]])
+
 #: The calibration of a rectified rig.
 FIVE = "fx: 50\nfy: 50\ncx: 31.5\ncy: 23.5\nbaseline: 0.2\n"
 
@@ -146,7 +149,6 @@ def write_two_folders(folder: Path) -> Path:
 
 
 def stereo_entries(baseline: float = 0.2) -> dict[str, np.ndarray | int]:
-    K = np.array([[50.0, 0, 31.5], [0, 51.0, 23.5], [0, 0, 1]])
     D = np.array([[-0.2, 0.05, 0.001, -0.001, 0.0]])
     R = cv2.Rodrigues(np.array([0.01, -0.02, 0.005]))[0]
     T = R @ np.array([[-baseline], [0.001], [0.002]])

@@ -22,7 +22,7 @@ class EkfConfig:
 
     Attributes:
         papers: closest to the papers' filter: the left pixel alone, one linearisation, landmarks in the world, a
-            covariance that is not transported, features that do not slide. The other options do not count then. What
+            covariance that is not transported, features that do not slide. No other option may be set then. What
             stays is the gate by what all others predict, the outlier test, the recovery, and the limit of 300 landmarks
             in the state.
         measurement: ``"stereo"`` measures (uL, vL, uR), ``"left"`` the left pixel alone, as the papers do (paper A, V).
@@ -45,6 +45,8 @@ class EkfConfig:
 
     def __post_init__(self) -> None:
         require_positive(self, {"iterations": (1, 1000)}, "ekf")
+        if self.papers and replace(self, papers=False) != EkfConfig():
+            raise ConfigurationError("ekf: papers=true chooses the other options itself; leave them out")
         for name, known in (("measurement", MEASUREMENTS), ("landmarks", tuple(COORDINATES))):
             if getattr(self, name) not in known:
                 raise ConfigurationError(f"ekf: {name} must be one of {known}, got {getattr(self, name)!r}")
@@ -55,7 +57,8 @@ class EkfBackend(LandmarkFilter):
 
     The state is ``[r, φ, v, ω]`` (12), world position, Euler angles, world velocity and angle rates (paper B, section
     2), then three coordinates per landmark. The camera moves at constant velocity disturbed by impulses, with
-    the printed A and W. A landmark enters with its full cross-covariance (paper A, Eqs. 8 and 10).
+    the printed W and, with ``papers=True``, the printed A (`backends.ekf.motion`). A landmark enters with its full
+    cross-covariance (paper A, Eqs. 8 and 10).
 
     By default this is not the papers' plain filter: `EkfConfig` says what differs, and what ``papers=True`` undoes.
     The angles refer to a world of their own in both (`backends.ekf.motion`).

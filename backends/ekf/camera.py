@@ -1,9 +1,9 @@
 """What a filter asks of its camera, and what all cameras share: the prior, and the noise of a motion.
 
 An error is what is true less what is believed: adding it corrects. The camera's (12,) is of its pose (6), velocity (3)
-and rate (3), in numbers that each camera chooses. `Camera.world` says which displacement of the world an error of the
-pose is, ``gauge`` of `backends.ekf.landmarks` how that changes a landmark's coordinates; their product is how far an
-error of the pose moves the landmarks with it.
+and rate (3), in numbers that each camera chooses. An error of the pose is as if the whole world were displaced: by how
+much says `Camera.displacement`. What a displacement of the world changes in a landmark's coordinates is ``gauge`` of
+`backends.ekf.landmarks`; the product says how an error of the pose moves landmarks that the camera takes along.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Camera(Protocol):
     def by_error(self) -> Array:
         """Derivative (6, 6) of the pose's right perturbation [rotation, translation] by the pose's error."""
 
-    def world(self) -> Array:
+    def displacement(self) -> Array:
         """The displacement (6, 6) of the world [shift, turn about its origin] that is an error of the pose."""
 
     def moved(self, error: Array) -> Self:

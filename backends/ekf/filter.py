@@ -6,10 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.linalg import LinAlgError
 
 from backends.ekf.camera import Camera, moved
 from backends.ekf.covariance import CAMERA, POSE, RECENT, Covariance, positive
-from backends.ekf.innovation import UnsolvableError, Update
+from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from backends.ekf.recovery import agreement
 from backends.ekf.state import FilterState
@@ -203,7 +204,7 @@ class LandmarkFilter:
 
     def _predicted(self, stamp: float, rests: bool) -> Prediction:
         """Go to a time, and say what is in the angle of view then; whether the camera rests meanwhile."""
-        s = self.state
+        s = self.state.relieved()
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
         if s.frame < 0:
             after = replace(s, stamp=float(stamp), frame=0, closed=False)
@@ -214,7 +215,7 @@ class LandmarkFilter:
         after = after.slid(self._coordinates, rows, self.models.slide.density / self._measure.stereo.f)
         marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
-        A = -toward @ (marks.gauge @ after.camera.world())  # derivatives (M, 3, 6) of them, seen from the camera
+        A = -toward @ (marks.gauge @ after.camera.displacement())  # derivatives (M, 3, 6) of them, seen from the camera
         seen = (A @ after.covariance.pose + 2 * toward @ cross) @ A.transpose(0, 2, 1)
         seen = 0.5 * (seen + seen.transpose(0, 2, 1)) + toward @ blocks @ toward.transpose(0, 2, 1)
         left, right, S = self._measure.pixels((marks.points - T[:3, 3]) @ T[:3, :3], seen)
@@ -248,9 +249,9 @@ class LandmarkFilter:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids.copy())
             after = s.corrected(found)
-        except UnsolvableError as error:
+        except LinAlgError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self.name}: {error}")
-        used, w = found.used, found.whitened.w
+        used, w = found.used, found.w
         dof, ids = int(np.isfinite(z[used]).sum()), observations.ids
         return after, UpdateReport(UpdateStatus.OK, "", ids[used], ids[~used], float(w @ w), dof)
 

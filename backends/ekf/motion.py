@@ -1,4 +1,4 @@
-"""How the camera moves, for [r, φ, v, ω] and its printed transition (paper B, section 2).
+"""How the camera moves, for [r, φ, v, ω] and its transition (paper B, section 2).
 
 The papers' ``R(φ) = Rz(φz) Ry(φy) Rx(φx)`` (paper B, below Eq. 2) takes camera coordinates to a world whose axes may
 be chosen; it is singular at φy = ±90°. With z forward, y down and the first camera as the world, turning 90° about the
@@ -30,7 +30,6 @@ from slam.models import EstimatorModels
 
 _ACROSS = 0.1  # numerics: sine of an angle between two axes above which it is known what is across both
 _PIECES = 64  # numerics: at most, of one step through the angles' singularity
-_SMALL_TURN = 0.2  # numerics: of a step whose error may be carried as a turn about the world's axes [rad]
 
 
 #: Camera axes (right, down, forward) in an angles' world chosen for it: forward is x, right is y, down is z.
@@ -67,7 +66,7 @@ class EulerCamera:
         J[:3, 3:], J[3:, :3] = body_rate_matrix(self.x[3:6]), self.pose[:3, :3].T
         return J
 
-    def world(self) -> Array:
+    def displacement(self) -> Array:
         """See `Camera`."""
         W, A = np.eye(POSE), turning(self.R_world_angles, self.x)
         W[:3, 3:], W[3:, 3:] = hat(self.x[:3]) @ A, A
@@ -102,7 +101,7 @@ class EulerCamera:
         return J
 
     def advanced(self, dt: float) -> tuple[EulerCamera, Array, Array]:
-        """See `Camera`: the printed A and W, in pieces through the angles' singularity.
+        """See `Camera`: in pieces through the angles' singularity.
 
         Impulses at the beginning change the velocities, after the first new world, and A carries them on.
         """
@@ -120,16 +119,17 @@ class EulerCamera:
         return camera, J, W
 
     def _transition(self, dt: float) -> tuple[EulerCamera, Array]:
-        """``x ← f(x)`` with the printed A.
+        """``x ← f(x)`` as printed, and A: as printed if the covariance is not transported.
 
         If the covariance is transported, the attitude's error is carried as a turn about the world's axes, not as one
         of the angles φ. The printed transition has constant rates of the angles, which is not the same in another
-        world. The difference is of second order; in long steps, where it would not be, it is left as printed.
+        world: with these A is no derivative of f, by what is of second order in a step. As printed, A is one, but the
+        covariance would shrink along turns of the world, which nothing measures, in every step.
         """
         x, A = self.x.copy(), np.eye(CAMERA)
         x[:POSE] += dt * self.x[POSE:]
         A[:POSE, POSE:] = dt * np.eye(POSE)
-        if self.transports and np.abs(x[3:6] - self.x[3:6]).max() < _SMALL_TURN:
+        if self.transports:
             J, R = np.eye(CAMERA), self.R_world_angles
             J[3:6, 3:6] = np.linalg.solve(turning(R, x), turning(R, self.x))
             A = A @ J

@@ -15,10 +15,11 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
+from numpy.linalg import LinAlgError
 
 from backends.ekf.covariance import CAMERA
-from backends.ekf.innovation import UnsolvableError, Update
-from backends.ekf.solve import Gated, Posterior, gate, solve
+from backends.ekf.innovation import Solution, Update
+from backends.ekf.solve import Gated, gate, solve
 from slam.geometry import se3
 from slam.geometry.se3 import Array
 from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, by_chance
@@ -27,23 +28,24 @@ from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, b
 Search = Callable[[], "Array | None"]
 
 
-def agreement(update: Update, search: Search) -> Posterior | None:
+def agreement(update: Update, search: Search) -> Solution | None:
     """Solve with the prior, or where it fails the pose, that most observations agree with; None where there is none.
 
     Where less than a third of the observations agrees, and as many wrong ones might agree by chance, that agreement is
-    ignored: it could move the pose anywhere. `search` is only called where nothing else helps. Raises UnsolvableError
+    ignored: it could move the pose anywhere. `search` is only called where nothing else helps. Raises LinAlgError
     where the reason is numerical.
     """
     if not (np.isfinite(update.camera.pose).all() and math.isfinite(update.covariance.P.trace())):
-        raise UnsolvableError("the predicted state is not finite")
+        raise LinAlgError("the predicted state is not finite")
     found, error, majority = None, None, (len(update.z) + 1) // 2
     least = max(MIN_OBSERVATIONS, majority)  # what passes the gate; in the end `solve` takes out what disagrees
     starts = [(None, least), (None, 0)] if update.guess is None else [(None, least), (update.guess, least), (None, 0)]
+    gates: dict[bool, Gated] = {}
     for T, passing in starts:
         try:
-            gated = gate(update, T)
+            gated = gates[T is None] = gates.get(T is None) or gate(update, T)
             agreed = _agreed(gated) if gated.used.sum() >= passing else None
-        except UnsolvableError as reason:  # another start may do
+        except LinAlgError as reason:  # another start may do
             error = reason
             continue
         found = agreed or found
@@ -55,7 +57,7 @@ def agreement(update: Update, search: Search) -> Posterior | None:
     return found
 
 
-def _restarted(update: Update, search: Search, least: int) -> Posterior | None:
+def _restarted(update: Update, search: Search, least: int) -> Solution | None:
     """At the pose on which landmarks agree, if at least so many do."""
     T = search() if len(update.z) >= least else None
     if T is None:
@@ -64,20 +66,21 @@ def _restarted(update: Update, search: Search, least: int) -> Posterior | None:
     far, turned = np.linalg.norm(T[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ T[:3, :3])
     sigmas = far, turned, models.initial_velocity_sigma, models.initial_angular_velocity_sigma
     there, noise = update.facing(T), np.diag(np.repeat(np.array(sigmas, float) ** 2, 3))
+    noise = there.camera.of_body(noise)
     there = replace(there, covariance=there.covariance.camera_moved(np.eye(CAMERA), noise))
-    with suppress(UnsolvableError):
+    with suppress(LinAlgError):
         found = solve(gate(there, T))
         return found if found is not None and found.used.sum() >= least else None
     return None
 
 
-def _agreed(gated: Gated) -> Posterior | None:
+def _agreed(gated: Gated) -> Solution | None:
     """What agrees with a prediction, if it is more than might agree by chance at the gate's own level."""
     found = solve(gated)
     used, count = 0 if found is None else int(found.used.sum()), len(gated.used)
     if count < MIN_OBSERVATIONS or ONE_AGREES_IN * used >= count:
         return found
     rejected = gated.distances[~gated.used & np.isfinite(gated.distances)]
-    probability = gated.innovation.at.update.measure.models.gate_probability
+    probability = gated.at.update.measure.models.gate_probability
     chance = by_chance(rejected, used, count, float(gated.limits.max()), probability)
     return None if chance else found

@@ -8,14 +8,13 @@ by ``P Hᵀ y``.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
+from numpy.linalg import LinAlgError
 from scipy.linalg.lapack import dpotrf
 
-from backends.ekf.camera import Camera
 from backends.ekf.covariance import CAMERA, POSE
-from backends.ekf.innovation import Innovation, UnsolvableError, Update, Whitened
+from backends.ekf.innovation import Linearisation, Solution, Update
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray
 from slam.geometry.se3 import Array
@@ -30,67 +29,48 @@ _POSE_SHARE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Posterior:
-    """The maximum of the posterior (or one step towards it)."""
-
-    whitened: Whitened  # the last innovation, from which the covariance follows
-    change: Array  # of the state (n,) from the prior, in the prior's coordinates
-
-    @property
-    def used(self) -> BoolArray:
-        """Which landmarks (M,) it is made of."""
-        return self.whitened.used
-
-    @cached_property
-    def camera(self) -> Camera:
-        """After the update."""
-        return self.whitened.innovation.at.camera_after(self.change)
-
-
-@dataclass(frozen=True, eq=False)
 class Gated:
     """Which landmarks each lie within the gate of their own innovation covariance."""
 
     used: BoolArray  # (M,)
     limits: Array  # of the gate (M,)
     distances: Array  # squared, of the innovations (M,); NaN where none is predicted
-    innovation: Innovation
+    at: Linearisation  # where they are from
 
 
 def gate(update: Update, T: Array | None = None) -> Gated:
     """Test each landmark by itself, with its innovation linearised at the prior, or with the camera at a pose T (4, 4).
 
-    Raises UnsolvableError where S is not positive definite.
+    Raises LinAlgError where S is not positive definite.
     """
-    start = update.at(None if T is None else update.camera.at(T))
-    innovation = start.innovation()
+    at = update.linearised(None if T is None else update.camera.at(T))
     limits = chi_square_limits(np.isfinite(update.z).sum(axis=1), update.measure.models.gate_probability)
-    own = squared_distances(innovation.nu.reshape(-1, 3), _blocks(innovation.S))
+    own = squared_distances(at.nu.reshape(-1, 3), _blocks(at.S))
     if not np.isfinite(own).all():
-        raise UnsolvableError("the predicted innovations are not finite or not positive definite")
-    distances = np.where(np.isfinite(start.z).all(axis=1), own, np.nan)
-    return Gated(np.asarray(distances <= limits), limits, distances, innovation)
+        raise LinAlgError("the predicted innovations are not finite or not positive definite")
+    distances = np.where(np.isfinite(at.z).all(axis=1), own, np.nan)
+    return Gated(np.asarray(distances <= limits), limits, distances, at)
 
 
-def solve(gated: Gated) -> Posterior | None:
+def solve(gated: Gated) -> Solution | None:
     """Solve with what passed the gate and agrees; then once more with what the solution predicts after all.
 
-    None where nothing is left. Raises UnsolvableError where S or the pose's covariance is not positive definite, or the
+    None where nothing is left. Raises LinAlgError where S or the pose's covariance is not positive definite, or the
     new state not finite.
     """
-    found, update = _twice(gated), gated.innovation.at.update
+    found, update = _twice(gated), gated.at.update
     if found is not None:
         faced = update.facing(found.camera.pose)
         if faced.camera is not update.camera:  # the coordinates of its error are nearly singular there
             found, update = _twice(gate(faced, faced.guess)), faced
     if found is not None:
-        root = found.whitened.by_pose
+        root = found.by_pose
         if dpotrf(update.covariance.pose - root.T @ root, lower=1)[1] != 0:
-            raise UnsolvableError("the pose's covariance would not stay positive definite")
+            raise LinAlgError("the pose's covariance would not stay positive definite")
     return found
 
 
-def _twice(gated: Gated) -> Posterior | None:
+def _twice(gated: Gated) -> Solution | None:
     """With what passed the gate, and again where the solution predicts more."""
     found = _agreeing(gated, gated.used)
     if found is not None:
@@ -99,16 +79,16 @@ def _twice(gated: Gated) -> Posterior | None:
     return found
 
 
-def _agreeing(gated: Gated, used: BoolArray) -> Posterior | None:
+def _agreeing(gated: Gated, used: BoolArray) -> Solution | None:
     """Solve with some landmarks (mask (M,)), and take out what the other measurements contradict, the worst first.
 
     A wrong match spoils the tests of its neighbours, so a round takes out only landmarks at least half as far off as
     the worst one, until all that is left agrees; None where nothing is left.
     """
     while used.any():
-        found = _iterate(gated.innovation, used)
+        found = _iterate(gated.at, used)
         used = found.used
-        excess = found.whitened.distances() / gated.limits
+        excess = found.distances() / gated.limits
         worst = excess.max()
         if worst <= 1:
             return found if used.any() else None
@@ -116,19 +96,19 @@ def _agreeing(gated: Gated, used: BoolArray) -> Posterior | None:
     return None
 
 
-def _predicted(found: Posterior, gated: Gated) -> BoolArray:
+def _predicted(found: Solution, gated: Gated) -> BoolArray:
     """Which landmarks (mask (M,)) that a solution does not use lie within the gate of what it predicts of them.
 
     The gate tested them at the prior. With X the covariance of w with such a landmark's innovation ν, that given the
     used ones is ``ν − Xᵀ w``, and its covariance ``S − Xᵀ X``.
     """
-    nu, agree = found.whitened.innovation, np.zeros(len(found.used), bool)
-    out = np.flatnonzero(~found.used & nu.at.seen.any(axis=1) & np.isfinite(gated.distances))
+    at, agree = found.at, np.zeros(len(found.used), bool)
+    out = np.flatnonzero(~found.used & at.seen.any(axis=1) & np.isfinite(gated.distances))
     if len(out):
         numbers = (3 * out[:, None] + np.arange(3)).ravel()
-        X = found.whitened.inverse @ nu.S[found.whitened.rows[:, None], numbers]
-        S = nu.S[numbers[:, None], numbers] - X.T @ X
-        residuals = (nu.nu[numbers] - found.whitened.w @ X).reshape(-1, 3)
+        X = found.L_inverse @ at.S[found.rows[:, None], numbers]
+        S = at.S[numbers[:, None], numbers] - X.T @ X
+        residuals = (at.nu[numbers] - found.w @ X).reshape(-1, 3)
         agree[out] = squared_distances(residuals, _blocks(S)) <= gated.limits[out]
     return agree
 
@@ -139,40 +119,39 @@ def _blocks(S: Array) -> Array:
     return np.asarray(S.reshape(len(each), 3, len(each), 3)[each, :, each])
 
 
-def _iterate(innovation: Innovation, used: BoolArray) -> Posterior:
-    """An update by some landmarks (mask (M,)), first linearised as that innovation is: Gauss-Newton on the posterior.
+def _iterate(at: Linearisation, used: BoolArray) -> Solution:
+    """An update by some landmarks (mask (M,)), first linearised as it is there, then at each solution (Gauss-Newton).
 
     Where the first is not linear, the guess is the next place. One iteration is taken as it is: the papers' filter.
-    What comes to lie behind the camera counts no more.
+    What comes to lie behind the camera counts no more. Without the transport of the covariance this ends at the maximum
+    of the posterior. With it H leaves out what would measure the gauge, and the end is off that by what is of second
+    order in a step.
     """
-    update, posterior = innovation.at.update, None
+    update, found = at.update, None
     for iteration in range(update.iterations):
         if iteration == 1 and update.guess is not None:
-            innovation = update.at(update.camera.at(update.guess)).innovation()
-        elif posterior is not None:
-            innovation = update.at(posterior.camera, posterior.change[CAMERA:]).innovation()
-        used = used & innovation.at.seen.any(axis=1)
-        whitened = innovation.whitened(used)
-        change = np.delete(whitened.y @ innovation.HP[whitened.rows], np.s_[CAMERA : update.covariance.begin])
-        if not np.isfinite(change).all():
-            raise UnsolvableError("the corrected state is not finite")
-        posterior = Posterior(whitened, change)
-        if update.iterations == 1 or _linear(posterior):
+            at = update.linearised(update.camera.at(update.guess))
+        elif found is not None:
+            at = update.linearised(found.camera, found.change[CAMERA:])
+        used = used & at.seen.any(axis=1)
+        found = at.solved(used)
+        if not np.isfinite(found.change).all() or np.abs((found.change - at.change)[3:6]).max() > np.pi:
+            raise LinAlgError("a step is not finite, or turns the camera by more than half a turn")
+        if update.iterations == 1 or _linear(found):
             break
-    assert posterior is not None  # there is one iteration at least
-    return posterior
+    assert found is not None  # there is one iteration at least
+    return found
 
 
-def _linear(found: Posterior) -> bool:
+def _linear(found: Solution) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
-    whitened, now = found.whitened, found.whitened.innovation.at
-    update = now.update
+    now, update = found.at, found.at.update
     step = (found.change - now.change)[update.measured]
     seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
     errors = update.predicted(found.camera, found.change) - now.z - (now.own @ seen[:, :, None])[:, :, 0]
-    errors = np.where(now.seen & whitened.used[:, None], errors, 0.0)
+    errors = np.where(now.seen & found.used[:, None], errors, 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
-    shift = (whitened.inverse @ errors.reshape(-1)[whitened.rows]) @ whitened.by_pose
-    variances = update.covariance.pose.diagonal() - (whitened.by_pose**2).sum(axis=0)
+    shift = (found.L_inverse @ errors.reshape(-1)[found.rows]) @ found.by_pose
+    variances = update.covariance.pose.diagonal() - (found.by_pose**2).sum(axis=0)
     return bool((shift**2 <= _POSE_SHARE**2 * variances).all())

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.linalg import LinAlgError
 
 from backends.ekf.camera import Camera, Motion
 from backends.ekf.covariance import CAMERA, HEAD, Covariance
-from backends.ekf.innovation import UnsolvableError
+from backends.ekf.innovation import Solution
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
-from backends.ekf.solve import Posterior
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
 
@@ -98,10 +98,10 @@ class FilterState:
         D = coordinates.inverse_jacobian(anchors, new.c) @ R
         noise = D @ covariances @ D.transpose(0, 2, 1)
         by_rig = np.zeros((len(h), 3, self.covariance.by_rig.shape[1])) if by_rig is None else D @ by_rig
-        covariance = self.covariance.appended(new.gauge @ self.camera.world(), noise, by_rig)
+        covariance = self.covariance.appended(new.gauge @ self.camera.displacement(), noise, by_rig)
         end = self.covariance.correlated
         landmarks = self.landmarks.select(slice(end)).joined(new).joined(self.landmarks.select(slice(end, None)))
-        return replace(self, closed=True, landmarks=landmarks, covariance=covariance).relieved()
+        return replace(self, closed=True, landmarks=landmarks, covariance=covariance)
 
     def inserted(self, new: FilterLandmarks, covariances: Array) -> FilterState:
         """With landmarks known from elsewhere, by covariances (M, 3, 3) of their coordinates."""
@@ -148,28 +148,27 @@ class FilterState:
 
     # --- updates ---
 
-    def corrected(self, found: Posterior) -> FilterState:
+    def corrected(self, found: Solution) -> FilterState:
         """After an update.
 
         A displacement of camera and landmarks together is unobservable. What it changes in each coordinate depends on
-        the state, though (how far the world's origin is, which way is depth), and an update moves the state. A filter
-        that goes on with the same covariance believes to have measured such displacements, in time very well (Huang,
-        Mourikis and Roumeliotis, 2010). If the camera transports its error, the covariance is therefore transported to
-        the corrected state: the error is taken to be the displacement that the camera's pose has, by its Jacobian in
-        old coordinates and in new, and what it leaves, which stays as it is: the error of an invariant filter (Barrau
-        and Bonnabel, 2015). Parked landmarks do not move, so that their coordinates need none. Raises
-        UnsolvableError where the new state is not finite, or a variance is lost in rounding.
+        the state, though, and an update moves the state: a filter that goes on with the same covariance believes to
+        have measured such displacements, in time very well (Huang, Mourikis and Roumeliotis, 2010). So the error is
+        taken apart: into the displacement of the world that the camera's pose is off by, written in the corrected
+        state's coordinates, and what it leaves, which stays as it is. That is the error of an invariant filter (Barrau
+        and Bonnabel, 2015). Parked landmarks do not move: their coordinates need no transport. Raises LinAlgError where
+        the new state is not finite, or a variance is lost in rounding.
         """
-        update, camera = found.whitened.innovation.at.update, found.camera
+        update, camera = found.at.update, found.camera
         marks = self.landmarks.moved(update.coordinates, self._parts()[1], found.change[CAMERA:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
-            raise UnsolvableError("the corrected state is not finite")
+            raise LinAlgError("the corrected state is not finite")
         marks.seen[update.rows[found.used]] = self.frame
         J, shift = update.camera.transport(camera), self._shift(marks, camera)
-        covariance = update.covariance.corrected(*found.whitened.gain_root(), J, shift)
+        covariance = update.covariance.corrected(*found.gain_root(), J, shift)
         if not (covariance.P.diagonal()[HEAD:] > 0).all():
-            raise UnsolvableError("a landmark's variance would not stay positive")
-        return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()
+            raise LinAlgError("a landmark's variance would not stay positive")
+        return replace(self, camera=camera, landmarks=marks, covariance=covariance)
 
     def displaced(self, coordinates: Coordinates, ids: IdArray, points: Array) -> FilterState:
         """With some landmarks at points (M, 3) [m]: their error stays, and the covariance is transported as above.
@@ -182,9 +181,9 @@ class FilterState:
         if not np.isfinite(marks.points).all():
             return self
         covariance = s.covariance.displaced(rows, (marks.c - before.c)[rows], s._shift(marks, s.camera))
-        return replace(s, landmarks=marks, covariance=covariance).relieved()
+        return replace(s, landmarks=marks, covariance=covariance)
 
     def _shift(self, marks: FilterLandmarks, camera: Camera) -> Array:
         """What is added to the errors (A, 3, 6) of landmarks that have moved, by the error of the pose."""
         change = (marks.gauge - self.landmarks.gauge)[self._parts()[1]]
-        return np.asarray(change @ camera.world() if camera.transports else np.zeros_like(change))
+        return np.asarray(change @ camera.displacement() if camera.transports else np.zeros_like(change))

@@ -6,15 +6,14 @@ stands the body's rate ω. The error of a right-invariant filter is a displaceme
 
     R = Exp(ξ_R) R̂,   p = p̂ + ξ_R × p̂ + ξ_p,   v = v̂ + ξ_R × v̂ + ξ_v,   p_i = p̂_i + ξ_R × p̂_i + ξ_i,   ω = ω̂ + ξ_ω
 
-to first order. In these coordinates the transition and all measurements have derivatives that do not depend on where
-the estimate is in the world, and a displacement of camera and map together, which nothing measures, is the same error
-``ξ_R = δ, ξ_p = ξ_i = t, ξ_v = ξ_ω = 0`` whatever the estimate is. No sequence of linearisations can inform on it.
+to first order. A displacement of camera and map together, which nothing measures, is the same error ``ξ_R = δ,
+ξ_p = ξ_i = t, ξ_v = ξ_ω = 0`` whatever the estimate is, and the transition keeps it: no sequence of linearisations can
+inform on it. The filter is an imperfect one in the terms of Barrau and Bonnabel: the rate ω is no part of the group, so
+other derivatives do depend on the estimate.
 
 The covariance is kept in the state's own coordinates here: ``[δp, θ, δv, δω]`` with ``R = Exp(θ) R̂``, and the
-landmarks' inverse depths, in which a far point's error is Gaussian. They are a linear map of ξ, which depends on the
-estimate: ``ξ = T(χ̂) [δp, θ, …]``. So that what is kept is ``T(χ̂)⁻¹ P_ξ T(χ̂)⁻ᵀ`` at any time, with the invariant
-filter's P_ξ, an update that moves the estimate from χ̂ to χ̂⁺ multiplies by ``T(χ̂⁺)⁻¹ T(χ̂)``: that is the transport of
-`backends.ekf.state.FilterState.corrected`. The transition needs none, as it is exact in these coordinates.
+landmarks' inverse depths, with ``ξ = T(χ̂) [δp, θ, …]``. An update that moves the estimate from χ̂ to χ̂⁺ multiplies them
+by ``T(χ̂⁺)⁻¹ T(χ̂)``, so that P_ξ stays: the transport of `backends.ekf.state.FilterState.corrected`.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ class InvariantCamera:
         J[:3, 3:] = J[3:, :3] = self.pose[:3, :3].T
         return J
 
-    def world(self) -> Array:
+    def displacement(self) -> Array:
         """See `Camera`: ``ξ_p = δp + p̂ × θ``."""
         W = np.eye(POSE)
         W[:3, 3:] = hat(self.pose[:3, 3])
@@ -109,8 +108,8 @@ class IekfConfig:
     """Options of `IekfBackend`.
 
     Attributes:
-        iterations: most linearisations in an update; 1 is the filter of the literature. More are made only in updates
-            where the first is not linear to within the noise.
+        iterations: most linearisations in an update. More than one are made only where the first is not linear to
+            within the noise.
 
     Raises:
         ConfigurationError: a value is out of its range.
@@ -125,10 +124,8 @@ class IekfConfig:
 class IekfBackend(LandmarkFilter):
     """Right-invariant extended Kalman filter over the camera's motion and the landmarks.
 
-    Gate, update, iteration, recovery, and the landmarks that leave the dense state are those of `backends.ekf`; what is
-    its own is the motion on SO(3) instead of Euler angles, and the invariant error, of which no sequence of
-    linearisations says where the world is (the module says why, and how it is kept). A landmark that leaves the dense
-    state takes its error in the world as it is with it, and comes back to the invariant one.
+    Gate, update, iteration, recovery, and the landmarks that leave the dense state are those of `backends.ekf`; its own
+    are the motion on SO(3) and the invariant error (see the module).
 
     Args:
         rig: the cameras, rectified.

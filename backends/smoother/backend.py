@@ -30,12 +30,9 @@ from slam.window.stereo import TOO_LATE, Field
 class SmootherBackend:
     """gtsam's incremental fixed-lag smoother over smart stereo factors.
 
-    In every frame the newest pose is found from the landmarks as they stand, with the motion model as a prior
-    (`slam.window.pose_only`), and becomes a pose of the factor graph: its measurements go into the smart factors, from
-    which gtsam eliminates the landmarks, and the last poses are estimated together. Frames that saw nothing hang at the
-    last pose of the graph. A landmark stands where its last measurements put it, given the poses; where few are in view
-    those that are measured for longer than the lag are variables. Covariances of poses and variables are gtsam's
-    marginals; those of other landmarks follow from their measurements and the poses'.
+    The newest pose and each landmark are estimated twice: the pose from the landmarks as they stand, which gates its
+    measurements (`slam.window.pose_only`), then by the graph; the landmark within its smart factor, then from its last
+    measurements and the graph's poses, which is where it stands.
 
     Args:
         rig: the cameras, rectified.

@@ -19,8 +19,8 @@ class SmootherConfig:
         landmarks: most landmarks that are variables of the graph. Where a frame measures no more than these, those that
             are measured for longer than a smart factor spans become variables, and keep what it says of them; but only
             while they are linear in space to less than a pixel's noise.
-        past: number of poses before those, at least, whose measurements are kept: where landmarks are seen again, or
-            measurements are mended, they say where the landmarks are.
+        past: number of poses before those, at least, whose measurements are kept (half as many poses more before
+            they are thrown away): where landmarks are seen again, or measurements are mended, they say where those are.
 
     Raises:
         ConfigurationError: a value is out of its range.

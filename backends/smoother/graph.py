@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -14,9 +16,6 @@ from slam.data import IdArray
 from slam.errors import SlamError
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
 
-#: What gtsam throws when it cannot solve.
-FAILURES = (RuntimeError, ValueError, LookupError)
-
 _ENDLESS = 1e9  # numerics: a lag that no run reaches
 _CAREFUL = 20  # numerics: poses after a failure whose factors are made so that they do not throw
 _FIRM = np.repeat([1e-10, 1e-8], 3)  # numerics: variances [rad²], [m²] with which the first pose is held
@@ -24,6 +23,15 @@ _FIRM = np.repeat([1e-10, 1e-8], 3)  # numerics: variances [rad²], [m²] with w
 
 class SolverError(SlamError):
     """The solver failed; the message is gtsam's, in one line."""
+
+
+@contextmanager
+def solving() -> Iterator[None]:
+    """Around calls of gtsam: what it throws is a SolverError."""
+    try:
+        yield
+    except (RuntimeError, ValueError, LookupError) as error:
+        raise SolverError(f"gtsam: {' '.join(str(error).split())[:200] or type(error).__name__}") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +55,15 @@ class Graph:
 
     Its first pose is held firmly, as nothing is measured but relative to it: with a pose that is hardly known in the
     world Cholesky's method would run out of digits. What is known of it is added to all covariances. If landmarks are
-    known in the world the first pose has its own covariance instead. So many poses before the newest one as
-    `lag` says are smoothed with it; None for all.
+    known in the world the first pose has its own covariance instead.
+
+    Attributes:
+        rebuilds: how often it was built anew after a failure.
+        number: of the newest pose in it; −1 for none.
     """
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:
-        self.rebuilds = 0  # how often it was built anew after a failure
+        self.rebuilds = 0
         self._careful = 0  # number of the first pose whose factors may be made quickly again, after a failure
         self._make, self._lag = make, lag
         self.restart()
@@ -67,7 +78,7 @@ class Graph:
             _ENDLESS if self._lag is None else float(self._lag), parameters
         )
         self._tracks = Tracks(self._make, self._lag)
-        self._number, self._taken = -1, 0
+        self.number, self._taken = -1, 0
         self._base: Array = np.zeros((6, 6))  # what is known of the first pose, besides its prior
         self._poses: dict[int, Array] = {}
         self._first = np.eye(4)  # the first pose
@@ -82,13 +93,13 @@ class Graph:
         graph as well.
         """
         why = ""
-        if self._number < s.number and self._is_of(s):
-            number, self._number = self._number, -1  # until it is done: an interrupted call leaves a graph unknown
+        if self.number < s.number and self._is_of(s):
+            number, self.number = self.number, -1  # until it is done: an interrupted call leaves a graph unknown
             try:
                 problem = GraphProblem(to_graph=inverse(self._to_state))
                 return self._update(s, range(number + 1, s.number + 1), problem), ""
-            except FAILURES as error:
-                why, self.rebuilds = line(error), self.rebuilds + 1
+            except SolverError as error:
+                why, self.rebuilds = str(error), self.rebuilds + 1
                 self._careful = s.number + (self._lag or _CAREFUL)
         if why:
             s = replace(s, landmarks=s.landmarks.without_variables(s.number))
@@ -98,14 +109,11 @@ class Graph:
         """The solution with all anew, linearised `again` so many times more; SolverError where gtsam fails."""
         self.restart()
         oldest, self._careful = self.oldest(s), max(self._careful, s.number + 1)
-        try:
-            self._kind, self._first = _kind(s), s.poses[s.of(oldest)]
-            prior, self._base = held(s, oldest)
-            begin = GraphProblem()
-            begin.factors.add(self._make.prior(oldest, self._first, prior))
-            return self._update(s, range(oldest, s.number + 1), begin, again)
-        except FAILURES as error:
-            raise SolverError(line(error)) from error
+        self._kind, self._first = _kind(s), s.poses[s.of(oldest)]
+        prior, self._base = held(s, oldest)
+        begin = GraphProblem()
+        begin.factors.add(self._make.prior(oldest, s.start if oldest == s.begun else self._first, prior))
+        return self._update(s, range(oldest, s.number + 1), begin, again)
 
     def displaced(self, M: Array) -> None:
         """Follow a displacement M (4, 4) of all that the state has in the world: what is in it is relative."""
@@ -129,18 +137,20 @@ class Graph:
             self._taken = len(s.sights[s.of(number)])
         kept = self._tracks.keep(problem, s)
         made = self._tracks.make_smart(problem, s.number < self._careful)
-        # Nothing leaves before the newest pose is solved for: what leaves fixes where its neighbours are linearised.
+        # Two steps of Gauss and Newton: in the first, nothing leaves. What leaves fixes where its neighbours stay
+        # linearised, and that is to be after the newest pose is solved for.
         now: Stamps = dict.fromkeys(problem.values.keys(), float(before))
-        self._solver.update(problem.factors, problem.values, now, problem.removed)
-        slots = self._solver.getISAM2Result().getNewFactorsIndices()
+        with solving():
+            self._solver.update(problem.factors, problem.values, now, problem.removed)
+            slots = self._solver.getISAM2Result().getNewFactorsIndices()
+            for _ in range(again):
+                self._solver.update()
+            self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.stamps)
+            values = self._solver.calculateEstimate()
         for track, place in made:
             track.slot = slots[place]
-        for _ in range(again):
-            self._solver.update()
-        self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.stamps)
         self._tracks.forget(s)
         new = [i for i in numbers if i >= oldest] if self._poses else [s.number]
-        values = self._solver.calculateEstimate()
         poses = self._to_state @ [values.atPose3(pose_key(i)).matrix() for i in range(oldest, s.number + 1)]
         self._poses = dict(zip(range(oldest, s.number + 1), poses))
         points, linearised = (
@@ -150,8 +160,8 @@ class Graph:
         joint = self._joint(list(range(max(oldest, s.number - 1), s.number + 1)))
         spread = np.array([*(self._joint([i]) for i in new[:-1]), joint[-6:, -6:]])
         if not (np.isfinite(poses).all() and np.isfinite(joint).all() and (np.diag(joint) > 0).all()):
-            raise ValueError("the solution is not finite, or a variance not positive")
-        self._number, self._tie = s.number, s.ties[s.of(s.number)]
+            raise SolverError("gtsam: the solution is not finite, or a variance not positive")
+        self.number, self._tie = s.number, s.ties[s.of(s.number)]
         return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, joint, spread)
 
     def joint_covariance(self, s: SmootherState, first: int | None = None) -> tuple[int, Array]:
@@ -163,11 +173,11 @@ class Graph:
         """
         if not self._is_of(s):
             return s.number, s.spread[-1]
-        oldest = self.oldest(s, max(self._number, s.number - (self._lag or 0)))
+        oldest = self.oldest(s, max(self.number, s.number - (self._lag or 0)))
         first = oldest if first is None else max(oldest, first)
-        begin = min(first, self._number)
-        P = self._joint(list(range(begin, self._number + 1)))
-        for tie in s.ties[s.of(self._number) + 1 :]:
+        begin = min(first, self.number)
+        P = self._joint(list(range(begin, self.number + 1)))
+        for tie in s.ties[s.of(self.number) + 1 :]:
             assert tie is not None  # only the pose with which the problem begins has none
             gain, rest = follows(adjoint(inverse(tie.relative)), P[-6:, -6:], tie.shared, tie.covariance)
             cross = gain @ P[-6:]
@@ -184,22 +194,19 @@ class Graph:
         R = self._to_state[:3, :3]
         return np.asarray(R @ self._solver.getISAM2().marginalCovariance(key) @ R.T + J @ self._base @ J.T)
 
-    @property
-    def newest(self) -> int:
-        """Number of the newest pose in it; −1 for none."""
-        return self._number
-
     def _is_of(self, s: SmootherState) -> bool:
         """Whether it is the state's graph, up to poses that entered since the last update.
 
         A pose of that number may be another frame, if the call that had added it was interrupted.
         """
-        known = max(s.begun, s.first) <= self._number <= s.number
-        return known and self._kind == _kind(s) and self._tie is s.ties[s.of(self._number)]
+        known = max(s.begun, s.first) <= self.number <= s.number
+        return known and self._kind == _kind(s) and self._tie is s.ties[s.of(self.number)]
 
     def _joint(self, numbers: list[int]) -> Array:
-        isam, keys = self._solver.getISAM2(), [pose_key(i) for i in numbers]
-        P = isam.marginalCovariance(keys[0]) if len(keys) == 1 else isam.jointMarginalCovariance(keys).fullMatrix()
+        keys = [pose_key(i) for i in numbers]
+        with solving():
+            isam = self._solver.getISAM2()
+            P = isam.marginalCovariance(keys[0]) if len(keys) == 1 else isam.jointMarginalCovariance(keys).fullMatrix()
         A = adjoint(inverse(np.array([self._poses[i] for i in numbers])) @ self._first).reshape(-1, 6)
         P = P + A @ self._base @ A.T
         return np.asarray(0.5 * (P + P.T))
@@ -230,17 +237,10 @@ def minimised(problem: GraphProblem, iterations: int) -> gtsam.Values:
     parameters.setMaxIterations(iterations)
     parameters.setRelativeErrorTol(1e-9)
     parameters.setAbsoluteErrorTol(1e-9)
-    try:
+    with solving():
         before = problem.factors.error(problem.values)
         values = gtsam.LevenbergMarquardtOptimizer(problem.factors, problem.values, parameters).optimize()
         after = problem.factors.error(values)
-    except FAILURES as error:
-        raise SolverError(line(error)) from error
     if not np.isfinite(after) or after > before:
         raise SolverError(f"Levenberg-Marquardt found no solution (error {before:.6g} to {after:.6g})")
     return values
-
-
-def line(error: BaseException) -> str:
-    """What gtsam says, in one line."""
-    return f"gtsam: {' '.join(str(error).split())[:200] or type(error).__name__}"

@@ -32,14 +32,16 @@ def corrected(s: SmootherState, correct: Callable[[Array], Array]) -> SmootherSt
 def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     """The last poses after a correction: the newest one stays where it is, the others and the landmarks move."""
     first = graph.oldest(s)
-    now = s.poses[s.of(first) :]
+    now, spread, start = s.poses[s.of(first) :], s.spread, s.start
     with suppress(SolverError):  # then the next update tries again
-        now = graph.rebuilt(s, _AGAIN).poses
+        solved = graph.rebuilt(s, _AGAIN)
+        now, spread = solved.poses, np.concatenate([spread[:-1], solved.spread[-1:]])
         if not s.anchored:
             M = s.poses[-1] @ inverse(now[-1])
             graph.displaced(M)
             now = M @ now
             now[-1] = s.poses[-1]
+            start = M @ start
     D = now[0] @ inverse(s.poses[s.of(first)])
     moved = np.concatenate([D @ s.poses[: s.of(first)], now])
     marks, last = s.landmarks, s.last.copy()
@@ -51,4 +53,4 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     at = -2 if s.inside and len(moved) > 1 else -1  # the pose at which the last frame but one hangs
     last[0] = moved[at] @ inverse(s.poses[at]) @ s.last[0]
     marks = marks.refined(steps.stereo, steps.models.pixel_sigma, s.first, moved)
-    return replace(s, poses=moved, last=last, landmarks=marks)
+    return replace(s, poses=moved, last=last, landmarks=marks, spread=spread, start=start)

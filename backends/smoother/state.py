@@ -83,6 +83,7 @@ class SmootherState:
     # covariance (6, 6) of the pose with which the problem begins before anything was measured from it, and that of its
     # attitude about the world's axes (3, 3) [rad²]
     prior: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    start: Array = field(default_factory=lambda: np.eye(4))  # where that pose was believed to be then (4, 4)
     turned: Array = field(default_factory=lambda: np.zeros((3, 3)))
     tie: Tie | None = None  # of the newest frame to the newest pose of the graph that is before it
     frame: int = -1  # number of the newest frame

@@ -129,7 +129,7 @@ class Steps(RectifiedMeasurement):
         marks.by_rig[seen] = _landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
         linear = math.sqrt(self.stereo.f / self.models.pixel_sigma)
         marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T, linear)
-        marks = marks.measured(seen, z[used], number, self.track, graph.oldest(s, number), graph.newest)
+        marks = marks.measured(seen, z[used], number, self.track, graph.oldest(s, number), graph.number)
         sight = Sight.of(marks, seen, z[used])
         if s.inside:  # the very first frame, in a map that is known
             after = replace(
@@ -257,7 +257,7 @@ def _begun(s: SmootherState, T: Array, covariance: Array, sight: Sight) -> Smoot
     return replace(
         s, begun=number, poses=np.concatenate([s.poses, T[None]]), sights=(*s.sights, sight), ties=(*s.ties, None),
         spread=np.concatenate([s.spread, covariance[None]]), last=np.stack([s.last[0], T]), pair=np.zeros((12, 12)),
-        shared=np.zeros((6, 12)), prior=covariance, turned=T[:3, :3] @ covariance[:3, :3] @ T[:3, :3].T,
+        shared=np.zeros((6, 12)), prior=covariance, start=T, turned=T[:3, :3] @ covariance[:3, :3] @ T[:3, :3].T,
         since=0, inside=True, tie=None,
     )  # fmt: skip
 
@@ -334,7 +334,11 @@ def _landmarks_by_rig(
 
 
 def _drift(P: Array, before: Array, newest: Array) -> Array:
-    """By how much (6, 6) the newest pose is less certain than the one before, from their joint covariance (12, 12)."""
+    """By how much (6, 6) the newest pose is less certain than the one before, from their joint covariance (12, 12).
+
+    It stands for the covariance of the motion between them, which it is where the motion has nothing to do with the
+    error before.
+    """
     A = adjoint(inverse(newest) @ before)
     values, vectors = np.linalg.eigh(P[6:, 6:] - A @ P[:6, :6] @ A.T)
     return np.asarray((vectors * values.clip(min=0)) @ vectors.T)

@@ -56,7 +56,9 @@ class Tracks:
     A landmark is a smart factor that grows until the landmark goes on in a new one (`SmootherLandmarks.measured`):
     factors end before their first pose leaves the lag. A landmark of which more is known than what was measured is a
     variable of its own, and so are some that were measured for longer: those take over what is in their smart factor.
-    So many poses before the newest one as `lag` says are smoothed with it; None for all.
+
+    No slot is named after its factor has left the solver: a factor begins at most `track` poses before the newest one,
+    which is no more than the lag and one (`Steps.track`).
     """
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from slam.atlas.keyframes import Keyframe, Loop
 from slam.checks import FARTHEST_POSITION, MOST_ID, definite, require_known
 from slam.data import Estimate, IdArray
 from slam.errors import MeasurementError, SlamError
-from slam.files import array, json_text, read_bytes, unpack, whole_file
+from slam.files import Kind, array, json_text, read_bytes, require_arrays, unpack, whole_file
 from slam.geometry.rig import StereoRig
 from slam.geometry.rig_numbers import rig_difference, rig_numbers
 from slam.geometry.se3 import Array, nearest_rotation
@@ -49,65 +49,46 @@ _TURNED = 1e-6  # guard: largest deviation from a rotation matrix
 _FAR, _HALF = FARTHEST_POSITION, 65504.0  # guard: [m]; the largest half float
 
 
-class _Kind(NamedTuple):
-    """What an array must be."""
-
-    dtype: type  # of its entries
-    shape: str  # a letter for each size that other arrays share, a figure for each that is fixed
-    least: float  # bounds of its entries
-    most: float
-    what: str = ""  # "pose" or "covariance" where each row must be one; "unknown" where entries may be NaN
-    field: str = ""  # attribute of a keyframe or loop that it holds
-
-
 #: Arrays of the landmarks.
 _LANDMARKS = {
-    "ids": _Kind(np.int64, "n", 0, MOST_ID), "positions": _Kind(np.float64, "n3", -_FAR, _FAR),
-    "covariances": _Kind(np.float64, "n33", -np.inf, np.inf),
-    "descriptors": _Kind(np.float32, "nd", -_LONGEST, _LONGEST), "laplacian": _Kind(np.int8, "n", -128, 127),
-    "seen": _Kind(np.int64, "n", 0, MOST_ID), "in_view": _Kind(np.int64, "n", 0, MOST_ID),
-    "seen_from": _Kind(np.float64, "n3", -_FAR, _FAR, "unknown"),
+    "ids": Kind(np.int64, "n", 0, MOST_ID), "positions": Kind(np.float64, "n3", -_FAR, _FAR),
+    "covariances": Kind(np.float64, "n33", -np.inf, np.inf),
+    "descriptors": Kind(np.float32, "nd", -_LONGEST, _LONGEST), "laplacian": Kind(np.int8, "n", -128, 127),
+    "seen": Kind(np.int64, "n", 0, MOST_ID), "in_view": Kind(np.int64, "n", 0, MOST_ID),
+    "seen_from": Kind(np.float64, "n3", -_FAR, _FAR, "unknown"),
 }  # fmt: skip
 
 #: Those, keyframes by their attributes, the features of all of them in succession, and loops.
 _ARRAYS = _LANDMARKS | {
-    "keyframe_stamps": _Kind(np.float64, "k", -_GREATEST, _GREATEST, field="stamp"),
-    "keyframe_poses": _Kind(np.float64, "k44", -_FAR, _FAR, "pose"),
-    "keyframe_odometry": _Kind(np.float64, "k44", -_FAR, _FAR, "pose", "T_odom_left"),
-    "keyframe_covariances": _Kind(np.float64, "k66", -_GREATEST, _GREATEST, "covariance", "covariance"),
-    "keyframe_steps": _Kind(np.float64, "k66", -_GREATEST, _GREATEST, "covariance", "step_covariance"),
-    "keyframe_shares": _Kind(np.float64, "k6m", -_GREATEST, _GREATEST, field="jacobian"),
-    "keyframe_travelled": _Kind(np.float64, "k", -_FAR, _FAR, field="travelled"),
-    "keyframe_depths": _Kind(np.float64, "k", np.nextafter(0, 1), _FAR, field="depth"),
-    "keyframe_features": _Kind(np.int64, "k", 0, MOST_ID),
-    "place_points": _Kind(np.float32, "f3", -_FAR, _FAR, field="points"),
-    "place_descriptors": _Kind(np.float16, "fd", -_HALF, _HALF, field="descriptors"),
-    "place_laplacian": _Kind(np.int8, "f", -128, 127, field="laplacian"),
-    "place_landmarks": _Kind(np.int64, "f", -1, MOST_ID, field="landmarks"),
-    "loop_pairs": _Kind(np.int64, "l2", 0, MOST_ID),
-    "loop_motions": _Kind(np.float64, "l44", -_FAR, _FAR, "pose", "T_first_second"),
-    "loop_covariances": _Kind(np.float64, "l66", -_GREATEST, _GREATEST, "covariance", "covariance"),
-    "loop_inliers": _Kind(np.int64, "l", 0, MOST_ID, field="inliers"),
-    "rig": _Kind(np.float64, "r", np.nextafter(0, 1), _GREATEST),
+    "keyframe_stamps": Kind(np.float64, "k", -_GREATEST, _GREATEST, field="stamp"),
+    "keyframe_poses": Kind(np.float64, "k44", -_FAR, _FAR, "pose"),
+    "keyframe_odometry": Kind(np.float64, "k44", -_FAR, _FAR, "pose", "T_odom_left"),
+    "keyframe_covariances": Kind(np.float64, "k66", -_GREATEST, _GREATEST, "covariance", "covariance"),
+    "keyframe_steps": Kind(np.float64, "k66", -_GREATEST, _GREATEST, "covariance", "step_covariance"),
+    "keyframe_shares": Kind(np.float64, "k6m", -_GREATEST, _GREATEST, field="jacobian"),
+    "keyframe_travelled": Kind(np.float64, "k", -_FAR, _FAR, field="travelled"),
+    "keyframe_depths": Kind(np.float64, "k", np.nextafter(0, 1), _FAR, field="depth"),
+    "keyframe_features": Kind(np.int64, "k", 0, MOST_ID),
+    "place_points": Kind(np.float32, "f3", -_FAR, _FAR, field="points"),
+    "place_descriptors": Kind(np.float16, "fd", -_HALF, _HALF, field="descriptors"),
+    "place_laplacian": Kind(np.int8, "f", -128, 127, field="laplacian"),
+    "place_landmarks": Kind(np.int64, "f", -1, MOST_ID, field="landmarks"),
+    "loop_pairs": Kind(np.int64, "l2", 0, MOST_ID),
+    "loop_motions": Kind(np.float64, "l44", -_FAR, _FAR, "pose", "T_first_second"),
+    "loop_covariances": Kind(np.float64, "l66", -_GREATEST, _GREATEST, "covariance", "covariance"),
+    "loop_inliers": Kind(np.int64, "l", 0, MOST_ID, field="inliers"),
+    "rig": Kind(np.float64, "r", np.nextafter(0, 1), _GREATEST),
 }
 
 
-def _require(arrays: Mapping[str, Any], kinds: Mapping[str, _Kind], source: str) -> None:
-    """Raise SlamError where an array is not of its kind, or sizes that should be equal are not."""
-    sizes: dict[str, int] = {}
+def _require(arrays: Mapping[str, Any], kinds: Mapping[str, Kind], source: str) -> None:
+    """Raise SlamError where arrays are not of their kinds, or a row is no pose or covariance though it must be one."""
+    require_arrays(arrays, kinds, source)
     for name, kind in kinds.items():
-        a = arrays[name]
-        if not isinstance(a, np.ndarray) or a.dtype != kind.dtype or a.ndim != len(kind.shape):
-            raise SlamError(f"{source}: {name} must be of {np.dtype(kind.dtype)}, with {len(kind.shape)} dimensions")
-        fits = [sizes.setdefault(c, n) == n if c.isalpha() else int(c) == n for c, n in zip(kind.shape, a.shape)]
-        if not (fits[0] if not len(a) else all(fits)):  # of no rows the others may be anything
-            raise SlamError(f"{source}: {name} has the shape {a.shape}, which does not fit the other arrays")
-        good = (kind.least <= a) & (a <= kind.most)
-        if not (good | np.isnan(a) if kind.what == "unknown" else good).all():
-            raise SlamError(f"{source}: {name} holds an impossible number")
-        if kind.what == "covariance" and any(_no_covariance(P) for P in a):
+        if kind.what == "covariance" and any(_no_covariance(P) for P in arrays[name]):
             raise SlamError(f"{source}: {name} holds what is no covariance")
-        if kind.what == "pose" and any(np.abs(nearest_rotation(T[:3, :3]) - T[:3, :3]).max() > _TURNED for T in a):
+        R = arrays[name][:, :3, :3] if kind.what == "pose" else ()
+        if any(np.abs(nearest_rotation(rotation) - rotation).max() > _TURNED for rotation in R):
             raise SlamError(f"{source}: {name} holds what is no pose")
 
 

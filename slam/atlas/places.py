@@ -9,7 +9,7 @@ not be recognised. For the same reason the vectors' mean is subtracted before th
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +34,7 @@ class PlaceIndex:
     # descriptors (F, D) of the keyframes so far, kept as long as words are still to be learnt
     early: tuple[NDArray[np.float16], ...] = ()
     count: int = 0  # number of keyframes
-    # of the keyframes, in the first `count` rows; none without words
-    vectors: Vectors = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    vectors: Vectors | None = None  # of the keyframes (count, W · D); None without words
 
     def with_new(self, descriptors: Vectors) -> PlaceIndex:
         """A copy with one more keyframe, which has descriptors (F, D)."""
@@ -52,10 +51,9 @@ class PlaceIndex:
 
     def similarity(self, descriptors: Vectors) -> NDArray[np.float32]:
         """How similar each keyframe (count,) is to descriptors (F, D): 1 for the same, about 0 for another place."""
-        if self.words is None:
+        if self.words is None or self.vectors is None:
             return np.zeros(self.count, np.float32)
-        vectors = self.vectors[: self.count]
-        mean = vectors.mean(axis=0)
+        vectors, mean = self.vectors, self.vectors.mean(axis=0)
         wanted = aggregate(descriptors, self.words) - mean
         products = vectors @ np.stack([wanted, mean], axis=1)
         squares = np.einsum("kn,kn->k", vectors, vectors) - 2 * products[:, 1] + mean @ mean
@@ -63,15 +61,11 @@ class PlaceIndex:
         return np.asarray((products[:, 0] - mean @ wanted) / np.maximum(lengths, _NONE), np.float32)
 
     def _appended(self, descriptors: Vectors) -> PlaceIndex:
-        """A copy with one more keyframe; both share the array, but this index's first `count` rows stay unchanged."""
+        """A copy with one more keyframe."""
         if self.words is None:
             return replace(self, count=self.count + 1)
-        vector, vectors = aggregate(descriptors, self.words), self.vectors
-        if self.count >= len(vectors):
-            vectors = np.zeros((max(64, 2 * self.count), len(vector)), np.float32)
-            if self.count:
-                vectors[: self.count] = self.vectors[: self.count]
-        vectors[self.count] = vector
+        vector = aggregate(descriptors, self.words)[None]
+        vectors = vector if self.vectors is None else np.concatenate([self.vectors, vector])
         return replace(self, vectors=vectors, count=self.count + 1)
 
 

@@ -292,19 +292,11 @@ class RemainingRigError:
         self._revised = np.zeros(len(calibration.model.names))  # changes of the correction that the whole path followed
         self._turned = np.zeros(6)  # how the world turned as the whole path was revised: a motion, on the left
         self._root: tuple[Array, Array] | None = None  # of the last covariance, which is asked for thrice in a frame
-        self._asked: tuple[Backend | None, bool] = None, False  # a back end, and whether it considers the rig's error
 
     def follow(self, backend: Backend, pose: Array | None = None) -> None:
         """Let a back end that can follow the errors, before its first frame; `pose` (6, m) is J of its first pose."""
-        if (considering := self._considering(backend)) is not None:
-            considering.consider(self.field, pose)
-
-    def _considering(self, backend: Backend) -> ConsideringBackend | None:
-        """The back end, if it considers the rig's error; that takes long to find out."""
-        if backend is not self._asked[0]:
-            considers = self._calibration.config.enabled and isinstance(backend, ConsideringBackend)
-            self._asked = backend, considers
-        return backend if self._asked[1] else None  # type: ignore[return-value]
+        if self._calibration.config.enabled and isinstance(backend, ConsideringBackend):
+            backend.consider(self.field, pose)
 
     def field(self, z: Array) -> Array:
         """Derivatives (N, 3, n + 2) of true rows (uL, vL, uR) by what is followed, at corrected rows (N, 3) [px]."""
@@ -346,9 +338,9 @@ class RemainingRigError:
 
     def added_to(self, backend: Backend, estimate: Estimate) -> Estimate:
         """The back end's estimate with the rig's uncertainty added."""
-        if (considering := self._considering(backend)) is None:
+        if not (self._calibration.config.enabled and isinstance(backend, ConsideringBackend)):
             return estimate
-        root, (J, L) = self._common_root(self._revised), considering.sensitivities(estimate.ids)
+        root, (J, L) = self._common_root(self._revised), backend.sensitivities(estimate.ids)
         J, L = J @ root, L @ root
         return changed(
             estimate, covariance=estimate.covariance + J @ J.T,
@@ -366,9 +358,9 @@ class RemainingRigError:
         as reported in each frame, with the correction of that time; else for the present path, in which a back end may
         have revised earlier poses.
         """
-        if (considering := self._considering(backend)) is None:
+        if not (self._calibration.config.enabled and isinstance(backend, ConsideringBackend)):
             return CommonError()
-        J, revised = _of_pose(considering), self._revised
+        J, revised = _of_pose(backend), self._revised
         if as_reported:
             J, revised = J.copy(), 0.0 * revised
             J[:, -1] -= J[:, :-2] @ self._revised

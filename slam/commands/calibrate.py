@@ -62,7 +62,7 @@ def unit_of(row: dict[str, Any], focal: float) -> tuple[float, str]:
 
 
 def _print(found: dict[str, Any]) -> None:
-    console, apart = Console(), found["apart"]
+    console, apart = Console(emoji=False), found["apart"]
     table = empty_table(
         "corrections: mean ± standard deviation", ["unit", "correction", *(["apart"] if apart else []), "usual"]
     )

@@ -23,13 +23,13 @@ from slam.runtime.compilation import compile_clock, working_time
 if TYPE_CHECKING:
     from slam.compare.tables import Group
 
-_console = Console()
+_console = Console(emoji=False)  # `mine:Zero:` is a back end
 _COLOURS = {"better": "green", "worse": "dark_orange3"}  # of verdicts
 
 
 def _bar(*columns: ProgressColumn, quiet: bool, **options: Any) -> RichProgress:
     """A progress bar on standard error that fits into 80 columns."""
-    shown = (TextColumn("{task.description}"), BarColumn(bar_width=10), MofNCompleteColumn(), *columns)
+    shown = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=10), MofNCompleteColumn(), *columns)
     return RichProgress(*shown, TimeRemainingColumn(), console=Console(stderr=True), disable=quiet, **options)
 
 
@@ -39,7 +39,7 @@ def progress(total: int | None, title: str, quiet: bool = False) -> Iterator[Cal
 
     While kernels are compiled the line says so, and how many are done.
     """
-    bar = _bar(TextColumn("{task.fields[status]}"), quiet=quiet, get_time=working_time)
+    bar = _bar(TextColumn("{task.fields[status]}", markup=False), quiet=quiet, get_time=working_time)
     task, last = bar.add_task(title, total=total, status="", visible=False), ""
 
     def compiling(done: int, of: int) -> None:
@@ -95,7 +95,7 @@ def print_conclusions(every: Sequence[Group]) -> None:
 
 def empty_table(title: str, names: Iterable[str]) -> Table:
     """An empty table with a column for each name."""
-    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table = Table(title=escape(title) or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("")
     for name in names:
         table.add_column(escape(name), justify="right")

@@ -78,9 +78,9 @@ def _pictures(group: Group) -> Iterator[tuple[str, str]]:
     runs = [RunData.read(run.folder, run.trial.backend) for run in shown]
     of_seed = f", seed {trial.seed}" if is_world(trial.sequence) else ""
     if "ate_online_m" in known and group.trials > 1:
-        text = f"{BY_KEY['ate_online_m'].label}, of every trial; lines join runs on the same recording."
+        text = "Online path error (ATE, aligned) of every trial; lines join runs on the same recording."
         yield text, _svg(_pairs(group))
-    yield f"Paths from above{of_seed}.", _svg(drawn(runs, "path"))
+    yield f"Paths{of_seed}.", _svg(drawn(runs, "path"))
     if "nees_per_dof" in known:
         text = f"Error of the pose{of_seed} (solid), and the σ that each back end claims (dashed)."
         yield text, _svg(drawn(runs, "errors"))

@@ -19,7 +19,7 @@ from slam.bodies.config import ObjectsConfig
 from slam.bodies.detector import ObjectDetector
 from slam.data import Estimate, StereoFeatures
 from slam.errors import ConfigurationError
-from slam.files import array, read_bytes, unpack, whole_file
+from slam.files import Kind, array, read_bytes, require_arrays, unpack, whole_file
 from slam.geometry.arrays import isin
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, log, pose, transform
@@ -32,6 +32,10 @@ from slam.tracks.table import Tracks
 _ALIKE = 0.45, 0.8  # largest descriptor distance, and its largest ratio to the second best
 _LARGEST = 2**28  # bytes of a database's file
 _FARTHEST = 1e8  # guard: of its numbers
+_ARRAYS = {
+    "points": Kind(np.float64, "m3", -_FARTHEST, _FARTHEST), "origin": Kind(np.float64, "3", -_FARTHEST, _FARTHEST),
+    "descriptors": Kind(np.float32, "md", -_FARTHEST, _FARTHEST), "laplacian": Kind(np.int8, "m", -1, 1),
+}  # fmt: skip
 _STEP = 1e-5  # numerics: of the finite differences [m]
 _CANDIDATES = 12  # cost: features with the largest determinants among which a triple is looked for
 _LEAST_SIDE, _LEAST_SINE = 0.08, 0.3  # between two points of a triple [m], and of its angles
@@ -77,26 +81,11 @@ class ObjectDatabase:
         """Read what `save` wrote; ConfigurationError where there is no such file, or it is none of a database."""
         source = f"object database {path}"
         members = unpack(read_bytes(path, _LARGEST, ConfigurationError), source, ConfigurationError)
-        names = ("points", "descriptors", "laplacian", "origin")
-        missing = [name for name in names if f"{name}.npy" not in members]
-        if missing:
+        if missing := [name for name in _ARRAYS if f"{name}.npy" not in members]:
             raise ConfigurationError(f"{source}: damaged, or no database of an object: it lacks {missing[0]}")
-        arrays = [array(members[f"{name}.npy"], name, source, ConfigurationError) for name in names]
-        if any(a.ndim == 0 or a.dtype.kind not in "fi" for a in arrays):
-            raise ConfigurationError(f"{source}: its arrays are not of numbers")
-        points, descriptors, laplacian, origin = arrays
-        with np.errstate(over="ignore"):
-            database = cls(
-                points.astype(float), descriptors.astype(np.float32), np.sign(laplacian).astype(np.int8),
-                origin.astype(float),
-            )  # fmt: skip
-        n = len(points)
-        shapes = points.shape, origin.shape, laplacian.shape, descriptors.shape[:1]
-        if shapes != ((n, 3), (3,), (n,), (n,)) or descriptors.ndim != 2:
-            raise ConfigurationError(f"{source}: its arrays do not belong together")
-        if not all((np.abs(a.astype(float)) < _FARTHEST).all() for a in arrays):
-            raise ConfigurationError(f"{source}: a number is not finite, or impossibly large")
-        return database
+        arrays = {name: array(members[f"{name}.npy"], name, source, ConfigurationError) for name in _ARRAYS}
+        require_arrays(arrays, _ARRAYS, source, ConfigurationError)
+        return cls(**arrays)
 
 
 @dataclass(frozen=True, eq=False)

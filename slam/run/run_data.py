@@ -175,7 +175,8 @@ def pose_errors(run: RunData) -> tuple[Array, Array, Array]:
     first, last = np.zeros(len(own), np.intp), np.arange(len(own))
     A = adjoint(inverse(inverse(own.poses[first]) @ own.poses))
     P, J = truth_covariances(true, run.truth_noise, first, last, A), by_mounting(true, run.truth_noise, first, last, A)
-    P[:, 3:, 3:] += J[:, 3:] @ np.swapaxes(J[:, 3:], 1, 2)  # a constant turn is taken from the rotation's error instead
+    J = J[:, 3:, 3:]  # of positions, by the sensor's place and its clock; a constant turn is taken from the errors
+    P[:, 3:, 3:] += J @ np.swapaxes(J, 1, 2)
     of_truth = np.column_stack([np.trace(P[:, i : i + 3, i : i + 3], axis1=1, axis2=2) for i in (3, 0)])
     claimed = run.deviations[np.searchsorted(run.online.stamps, own.stamps)]
     sigma = np.sqrt(claimed**2 + np.maximum(of_truth, 0.0) * [1, np.degrees(1) ** 2])

@@ -80,7 +80,7 @@ def listing(wanted: str | None, width: int) -> Iterator[str]:
                 return
             names = dict.fromkeys(name for s in every for name in (s.key.partition(".")[0], s.owner) if name)
             same = dict.fromkeys(s.key for s in every if s.key.rpartition(".")[2] == wanted)
-            line = unknown("section or setting", wanted or "", names)
+            line = unknown("section or setting", wanted or "", names) + "; or a class of your own: module:Class"
             raise UnknownNameError(f"{line}; there is {', '.join(same)}" if same else line)
     before = ""
     for setting in chosen:

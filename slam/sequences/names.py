@@ -28,11 +28,12 @@ _SHORTEST_MICRO = 10**4  # [µs] between frames: a hundred a second; no count of
 # Since 1973: seconds with a fraction, nano-, micro-, milliseconds, these with a fraction, too, or whole seconds; or
 # seconds since a start.
 _STAMP = re.compile(
-    r"(?<!\d)(?<!\d[.,])(?:([1-9]\d{8,9})(?:[.,]|[_-](?=(?:\d{6}|\d{9})(?!\d)))(\d{1,9})|([1-9]\d{17,18})|([1-9]\d{15})|([1-9]\d{12}(?:[.,]\d{1,6})?)"
-    r"|([12]\d{9})|(\d{1,10})[.,](\d{1,9}))(?!\d|[.,]\d)",
+    r"(?<!\d)(?<!\d[.,])(?:[1-9]\d{8,9}(?:[.,]|[_-](?=(?:\d{6}|\d{9})(?!\d)))\d{1,9}|[1-9]\d{17,18}|[1-9]\d{15}"
+    r"|[1-9]\d{12}(?:[.,]\d{1,6})?|[12]\d{9}|\d{1,10}[.,]\d{1,9})(?!\d|[.,]\d)",
     re.ASCII,
 )
-_SECONDS = re.compile(r"(-?\d{1,10})[.,](\d{1,9})", re.ASCII)  # a whole name
+_SECONDS = re.compile(r"-?\d{1,10}[.,]\d{1,9}", re.ASCII)  # a whole name
+_DECIMALS = {19: 0, 18: 0, 16: 3, 13: 6}  # from a stamp's unit to nanoseconds, by its digits; of seconds there are nine
 _DATE = re.compile(r"(?<!\d)20\d\d[-_.]?[01]\d[-_.]?[0-3]\d(?!\d)", re.ASCII)  # what follows is a time of day
 # A date and time, down to milli-, micro- or nanoseconds.
 _MOMENT = re.compile(
@@ -109,22 +110,20 @@ def keys_of(sides: Sequence[Sequence[str]]) -> Keys | None:
 
 def _stamps(names: Sequence[str]) -> IntArray | None:
     """A stamp [ns] that every name has and that tells the names apart."""
-    rows: list[list[tuple[str, ...]]] = [_STAMP.findall(name) for name in names]
-    whole = all(_SECONDS.fullmatch(name) for name in names)
-    if whole:
-        rows = [[("",) * 6 + match.groups()] for name in names if (match := _SECONDS.fullmatch(name))]
-    for parts in zip(*rows):
-        fractions = [part[1] or part[7] for part in parts]
-        if all(part[6] for part in parts) and any(map(_DATE.search, names)):
+    alone = all(_SECONDS.fullmatch(name) for name in names)
+    for texts in zip(*([name] if alone else _STAMP.findall(name) for name in names)):
+        parts = [_split(text) for text in texts]
+        lengths = {len(fraction) for _, fraction in parts}
+        since_start = all(fraction and not re.fullmatch(r"[1-9]\d{8,}", whole) for whole, fraction in parts)
+        if (since_start or alone) and any(map(_DATE.search, names)):
             continue
         # Fractions of unequal length have lost zeros at their ends, or those in front: then steps are uneven.
-        lengths = {len(fraction) for fraction in fractions}
-        if all(part[6] for part in parts) and not whole and len(lengths) == 1:
-            moments = [_nanoseconds(part, 0) for part in parts]
+        if since_start and not alone and len(lengths) == 1:
+            moments = [_nanoseconds(text, 0) for text in texts]
             if [names[row] for row in np.argsort(moments, kind="stable")] != sorted(names, key=natural):
                 continue  # seconds of a time of day, an exposure
         widths = (0, 6 if max(lengths) <= 6 else 9) if len(lengths) > 1 else (0,)
-        keys = min(([_nanoseconds(part, width) for part in parts] for width in widths), key=_unevenness)
+        keys = min(([_nanoseconds(text, width) for text in texts] for width in widths), key=_unevenness)
         step = median(_steps(keys) or [_LONGEST])  # beyond: a clock from its start, in a finer unit; below: a count
         if _SHORTEST < step <= _LONGEST and max(keys) <= MOST_NANOSECONDS and len(set(keys)) == len(keys):
             return np.array(keys, np.int64)
@@ -147,14 +146,18 @@ def _moments(names: Sequence[str]) -> IntArray | None:
     return None
 
 
-def _nanoseconds(part: tuple[str, ...], width: int) -> int:
-    """Of the digits of a stamp; its fraction filled up in front to `width`, if not zero."""
-    seconds, fraction, nano, micro, milli, whole = (part[0] or part[6], part[1] or part[7], *part[2:6])
-    if seconds or whole:
-        below = int(fraction.rjust(width, "0").ljust(9, "0"))
-        return int(seconds or whole) * 10**9 + (-below if seconds.startswith("-") else below)
-    whole_milli, _, below_milli = milli.replace(",", ".").partition(".")
-    return int(nano) if nano else int(micro) * 10**3 if micro else int(whole_milli + below_milli.ljust(6, "0"))
+def _split(text: str) -> tuple[str, str]:
+    """The digits of a stamp before and behind the point."""
+    whole, _, fraction = re.sub("[,_-]", ".", text.lstrip("-")).partition(".")
+    return whole, fraction
+
+
+def _nanoseconds(text: str, width: int) -> int:
+    """What a stamp says; the fraction of one in seconds is filled up in front to `width`."""
+    whole, fraction = _split(text)
+    decimals = _DECIMALS.get(len(whole), 9)
+    digits = whole + fraction.rjust(width if decimals == 9 else 0, "0").ljust(decimals, "0")
+    return -int(digits) if text.startswith("-") else int(digits)
 
 
 def _numbers(sides: Sequence[Sequence[str]]) -> Keys | None:

@@ -196,6 +196,7 @@ def estimate_is_in_order(factory: Factory) -> None:
     require((off < deviations).all(), "positions(ids) and the estimate differ by more than a standard deviation")
     for name, shape in (("ids", (0,)), ("positions", (0, 3)), ("covariances", (0, 3, 3))):
         require_same(getattr(pose_only, name), np.zeros(shape), f"{name} of estimate(landmarks=False)")
+    assert_covariance(whole.covariance, (6, 6), "pose")
     # A smoother may solve further for the whole estimate.
     off = np.abs(se3.log(se3.inverse(pose_only.T_world_left) @ whole.T_world_left))
     off /= np.sqrt(np.diag(whole.covariance))

@@ -131,8 +131,7 @@ def require(holds: bool | np.bool_, sentence: str) -> None:
 
 def require_status(report: UpdateReport, expected: UpdateStatus, what: str) -> None:
     """Fail unless an update ended as expected; `what` is the update's description."""
-    status = report.status
-    require(status is expected, f"status of {what}: {status!s} {report.reason!r}, not {expected.value}")
+    require(report.status is expected, f"status of {what}: {report.status!s} {report.reason!r}, not {expected.value}")
 
 
 def require_same(value: ArrayLike, expected: ArrayLike, what: str, tolerance: float = 0.0) -> None:
@@ -162,12 +161,10 @@ def assert_covariance(P: Array, shape: tuple[int, ...], what: str) -> None:
     """Fail unless P is finite, of that shape, symmetric and positive definite (or nearly)."""
     require(P.shape == shape, f"{what}: covariance of shape {P.shape}, {shape} expected")
     require(np.isfinite(P).all(), f"{what}: the covariance is not finite")
-    positive = not P.size or np.diagonal(P, axis1=-2, axis2=-1).min() > 0
-    require(positive, f"{what}: a variance is zero or negative, so the covariance is singular")
     scale = np.abs(P).max(initial=0.0)
     require(np.abs(P - np.swapaxes(P, -1, -2)).max(initial=0.0) <= 1e-9 * scale, f"{what}: covariance is not symmetric")
-    definite = not len(P) or np.linalg.eigvalsh(P).min() > -1e-9 * scale
-    require(definite, f"{what}: covariance is not positive definite")
+    definite = not len(P) or (np.linalg.eigvalsh(P).min() > -1e-9 * scale and P.diagonal(0, -2, -1).min() > 0)
+    require(definite, f"{what}: covariance is singular, or not positive definite")
 
 
 def assert_near(T: Array, truth: Array, what: str, factor: float = 1.0) -> None:

@@ -57,8 +57,8 @@ def _clear(pixel, others, count, separation):
 
 @kernel
 def census(
-    rows, counts, seen_from, looks, signs, view, expected, measured, withheld, frame, features, size, limits,
-    replaceable, kept,
+    rows, counts, seen_from, looks, signs, view, expected, measured, withheld, frame, features, limits, replaceable,
+    kept,
 ):  # fmt: skip
     """Which landmarks (N,) go, and which features (F,) are one of them; the columns of the table count the frame.
 
@@ -66,8 +66,8 @@ def census(
     """
     positions, local, uv, in_image, points, sigma = view
     feature_uv, feature_looks, feature_signs, order = features
-    margin, radius, same_distance, same_look = limits
-    _count(rows, counts, view, expected, measured, withheld, frame, feature_uv, order, size, margin, radius)
+    radius, same_distance, same_look = limits
+    _count(rows, counts, view, expected, measured, withheld, frame, feature_uv, order, radius)
     seen, newest = counts[0], 0
     going, known = np.zeros(len(rows), np.bool_), np.zeros(len(feature_uv), np.bool_)
     for n in range(len(rows)):
@@ -114,7 +114,7 @@ def distance(a, b):
 
 
 @helper
-def _count(rows, counts, view, expected, measured, withheld, frame, feature_uv, order, size, margin, radius):
+def _count(rows, counts, view, expected, measured, withheld, frame, feature_uv, order, radius):
     """Count a frame in the columns of the table."""
     seen, in_view, missed, last_seen, out_of_view, unseen = counts
     _, local, uv, in_image, points, sigma = view
@@ -122,8 +122,7 @@ def _count(rows, counts, view, expected, measured, withheld, frame, feature_uv, 
     for n in range(len(rows)):
         any_measured = any_measured or measured[n]
     for n in range(len(rows)):
-        row, shown = rows[n], expected[n] and in_image[n] and not withheld[n]
-        shown = shown and margin <= uv[n, 0] <= size[0] - 1 - margin and margin <= uv[n, 1] <= size[1] - 1 - margin
+        row, shown = rows[n], expected[n] and not withheld[n]
         shown = shown and not _hidden(uv[n], local[n, 2], radius, feature_uv, order, points, sigma)
         in_view[row] += shown or measured[n]
         missed[row] += shown

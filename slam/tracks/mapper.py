@@ -200,19 +200,15 @@ def depth_is_known(
     return np.asarray(rig.depth_deviation(points, pixel_sigma) < limit * points[:, 2])
 
 
-def surplus_landmarks(landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
-    """Which landmarks (N,) to erase so that `max_landmarks` remain.
+def surplus_landmarks(landmarks: LandmarkTable, config: MapConfig) -> IndexArray:
+    """Rows (K,) of the landmarks to erase so that `max_landmarks` remain, of a map that has more.
 
     First those that were measured in a single frame, then the others by their last measurement, oldest first; those
     measured in the newest frame last.
     """
-    out = np.zeros(len(landmarks.ids), bool)
-    surplus = len(out) - config.max_landmarks
-    if surplus > 0:
-        now = landmarks.last_seen == landmarks.last_seen.max()
-        order = np.lexsort((landmarks.last_seen, landmarks.seen > 1, now))
-        out[order[:surplus]] = True
-    return out
+    now = landmarks.last_seen == landmarks.last_seen.max()
+    order = np.lexsort((landmarks.last_seen, landmarks.seen > 1, now))
+    return np.sort(order[: len(order) - config.max_landmarks])
 
 
 def take_census(
@@ -221,27 +217,24 @@ def take_census(
 ) -> tuple[BoolArray, BoolArray]:  # fmt: skip
     """Count a frame for the landmarks at `rows` (N,), in place; which of them go, and which features (F,) are of one.
 
-    Of those `expected` (N,), the ones that are near the border or hidden, among features most of which are clearly
-    nearer, are not missed; nor are those `withheld` (N,) from the update, for which the frame counts as neither missed
-    nor seen. `measured` (N,) says which were measured. A landmark goes if it
+    An `expected` landmark (N,) that was not `measured` (N,) was missed, unless it is near the border, hidden by nearer
+    features, or `withheld` (N,) from the update. A landmark goes if it
 
-    - duplicates another one in view that was seen more often, or as often and is older. A feature's depth may differ
-      from a landmark's by stereo's uncertainty, else their points have to be the same;
+    - duplicates another one in view that was seen more often, or as often and is older;
     - is not continuously detected although in view (paper A, IV): missed too often in a row, seen in too small a share
       of the frames, or never confirmed; or was not seen for longer than a map remembers. Where no feature could take
       its place it stays, and one of a loaded map until this run has seen it;
-    - has just gone out of view, close to another one out of view that was seen more often, or is that other one, see
-      `MapConfig.spacing`. Those of a loaded map that this run has not seen yet are only such others.
+    - is out of view, and one of the two has just gone out of view that are closer than `MapConfig.spacing` allows.
     """
     t, c, f = table, config, features
     order = np.argsort(f.uv_left[:, 0], kind="stable")
     counts = t.seen, t.in_view, t.missed, t.last_seen, t.out_of_view, t.unseen
     seen = np.ascontiguousarray(f.uv_left), f.descriptors, f.laplacian, order
-    size = float(rig.left.width), float(rig.left.height)
-    limits = c.view_margin, c.occlusion_radius, c.same_distance, c.same_descriptor
+    inside = expected & rig.left.in_image(view.uv_left, c.view_margin)
+    limits = c.occlusion_radius, c.same_distance, c.same_descriptor
     replaceable = bool(f.has_stereo.any() or not len(f))
     kept = c.erase_missed, c.erase_share, c.confirmed, c.forget_after, float(c.spacing)
     return census(
-        rows, counts, t.seen_from, t.descriptors, t.laplacian, tuple(view), expected, measured, withheld, frame, seen,
-        size, limits, replaceable, kept,
+        rows, counts, t.seen_from, t.descriptors, t.laplacian, tuple(view), inside, measured, withheld, frame, seen,
+        limits, replaceable, kept,
     )  # fmt: skip

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from slam.geometry.se3 import Array, pose
+from slam.geometry.se3 import Array
 from slam.worlds.geometry import BACK, DOWN, FORWARD, LEFT, RIGHT, Parts, Rectangle, crate, rectangle
-from slam.worlds.paths import camera_poses, carried, clock, placed, sway, through, watching, yaw_pitch_roll
+from slam.worlds.paths import camera_poses, carried, clock, placed, sway, through, watching
 from slam.worlds.surfaces import Material, Shelves, Signs
 
 
@@ -155,7 +155,7 @@ def _desk_room(layout: int) -> list[Rectangle]:
         rectangle(top, (-0.75, WALL_Y - 0.05, TOP), RIGHT, BACK, occludes=True),
     ]
     for number, (material, size, place, turn, lift) in enumerate(_THINGS):
-        T = pose(yaw_pitch_roll(np.deg2rad(turn), 0, 0), np.array([*place, TOP + lift]))
+        T = placed((*place, TOP + lift), (np.deg2rad(turn), 0, 0))
         looks = Material(0, 0, material, 1000 * layout + 10 * number, 500, (0.006, 0.02))
         out += crate(size, looks, T_body_box=T, sides=("front", "left", "right", "top"))
     return out
@@ -238,9 +238,7 @@ def _box_poses(t: Array) -> Array:
     third = placed((x, y, z), (0.35 * t, 0, 0.4 * wave(7.0)))
     lower = placed((0.4 + 0.12 * wave(10.0), 1.15, -0.25), (0.4 + 0.3 * wave(13.0), 0, 0))
     opening = 0.6 - 0.6 * np.cos(2 * np.pi * t / 5.0)  # the lid turns about the hinge, up to 1.2 rad
-    lid = lower.copy()
-    lid[:, :3, :3] = lower[:, :3, :3] @ np.array([yaw_pitch_roll(0, 0, -a) for a in opening])
-    return np.stack([first, second, third, lower, lid])
+    return np.stack([first, second, third, lower, lower @ placed((0, 0, 0), (0, 0, -opening))])
 
 
 CAMERA = (0.03, -0.70, 0.027)  #: where the camera stands before the board, whose middle is the world's origin [m]

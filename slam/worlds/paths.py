@@ -21,11 +21,6 @@ def camera_poses(positions: Array, yaw: Array, pitch: Array, roll: Array) -> Arr
     return pose(about(yaw, 2) @ R_LEVEL @ about(pitch, 0) @ about(roll, 2), positions)
 
 
-def yaw_pitch_roll(yaw: float, pitch: float, roll: float) -> Array:
-    """``Rz(yaw) Ry(pitch) Rx(roll)`` (3, 3): the orientation of an object in world axes (paper B, step d)."""
-    return rotation(np.array([roll, pitch, yaw]))
-
-
 def sway(t: Array, rng: np.random.Generator, slowest: float, fastest: float, terms: int = 5) -> Array:
     """A smooth random signal (N,) of unit standard deviation with frequencies between two [Hz]."""
     frequency = np.exp(rng.uniform(np.log(slowest), np.log(fastest), terms))
@@ -93,6 +88,10 @@ def watching(t: Array, stamps: Array, way: str, rng: np.random.Generator) -> Arr
 
 
 def placed(place: Sequence[Array | float], angles: Sequence[Array | float]) -> Array:
-    """Poses (N, 4, 4) from coordinates x, y, z (N,) [m] and yaw, pitch, roll (N,) [rad], or one number for all."""
-    xyz, turns = (np.stack(np.broadcast_arrays(*columns), axis=-1) for columns in (place, angles))
-    return pose(np.array([yaw_pitch_roll(*a) for a in np.broadcast_to(turns, xyz.shape)]), xyz)
+    """Poses (..., 4, 4) of objects, from x, y, z [m] and yaw, pitch, roll [rad], each (...) or one number for all.
+
+    Their orientation is ``Rz(yaw) Ry(pitch) Rx(roll)`` in world axes (paper B, step d).
+    """
+    x, y, z, yaw, pitch, roll = np.broadcast_arrays(*place, *angles)
+    R = [rotation(one) for one in np.stack([roll, pitch, yaw], axis=-1).reshape(-1, 3)]
+    return pose(np.reshape(R, (*x.shape, 3, 3)), np.stack([x, y, z], axis=-1))

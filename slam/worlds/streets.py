@@ -12,11 +12,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slam.data import IdArray
-from slam.geometry.se3 import Array, pose
+from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.worlds.drives import EYE, SAME_ROAD, STEP, Road, around_blocks, level, read_path, sampled
 from slam.worlds.geometry import DOWN, Parts, Rectangle, crate, cuboid, rectangle
-from slam.worlds.paths import yaw_pitch_roll
+from slam.worlds.paths import placed
 from slam.worlds.surfaces import Facade, Material
 
 ASIDE = 9.0  #: from a road's middle to the house fronts [m]
@@ -221,7 +221,7 @@ class Streets:
         if self._tree.query(xy)[0] < aside - 0.3 or self._drives.query(xy)[0] < _CLEAR or bends:
             return None
         heading = float(np.arctan2(-along[0], along[1])) + (np.pi if side > 0 else 0.0)
-        return pose(yaw_pitch_roll(heading, 0, 0), np.array([*xy, self._low[row]]))
+        return placed((*xy, self._low[row]), (heading, 0, 0))
 
     def ground(self) -> Iterator[Rectangle]:
         """Square parts of the ground under all roads, as high and as steep as the roads there."""

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from backends.ekf.backend import EkfConfig
 from backends.ekf.camera import moved
 from backends.ekf.covariance import CAMERA, HEAD, Covariance
-from backends.ekf.innovation import Update, Whitened
+from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth
 from backends.ekf.motion import EulerCamera
 from backends.ekf.solve import gate, solve
@@ -240,7 +240,7 @@ def test_the_update_is_the_joseph_form(coordinates):
     x = np.concatenate([s.camera.x, marks.c.reshape(-1)])
 
     def predict(change):
-        return update.at(s.camera.moved(change[:12]), change[12:]).z.reshape(-1)
+        return update.linearised(s.camera.moved(change[:12]), change[12:]).z.reshape(-1)
 
     H, nu = jacobian(predict, 0 * x, 1e-5), z.reshape(-1) - predict(0 * x)
     S = H @ P @ H.T + 0.25 * np.eye(36)
@@ -252,7 +252,7 @@ def test_the_update_is_the_joseph_form(coordinates):
     assert np.abs(difference).max() < 1e-5  # what the differences leave in H
     found = np.concatenate([after.camera.x, after.landmarks.c.reshape(-1)])
     np.testing.assert_allclose(found, x + K @ nu, rtol=1e-6, atol=1e-6)
-    assert solution.whitened.w @ solution.whitened.w == pytest.approx(nu @ np.linalg.solve(S, nu), rel=1e-6)
+    assert solution.w @ solution.w == pytest.approx(nu @ np.linalg.solve(S, nu), rel=1e-6)
 
 
 @pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
@@ -306,8 +306,8 @@ def corrected(s: FilterState, update: Update) -> np.ndarray:
 
 
 def residuals(s: FilterState, update: Update, change: np.ndarray) -> np.ndarray:
-    """Whitened: of the prior, whose covariance is diagonal, and of the measurements."""
-    z = update.at(s.camera.moved(change[:12]), change[12:]).z
+    """Solution: of the prior, whose covariance is diagonal, and of the measurements."""
+    z = update.linearised(s.camera.moved(change[:12]), change[12:]).z
     prior = change / np.sqrt(np.diag(dense(s.covariance)))
     return np.concatenate([prior, ((update.z - z) / update.sigma).reshape(-1)])
 
@@ -323,7 +323,7 @@ def test_the_iterated_update_is_the_maximum_of_the_posterior(spread, monkeypatch
     cost = lambda x: residuals(s, update, deviation * x)  # noqa: E731
     best = least_squares(cost, np.zeros(48), xtol=1e-12, ftol=1e-12, gtol=1e-12)
     np.testing.assert_allclose(corrected(s, update), deviation * best.x, atol=1e-5)
-    w = solution.whitened.w
+    w = solution.w
     assert w @ w == pytest.approx(2 * best.cost, rel=1e-3)  # νᵀS⁻¹ν there is the least cost
 
 
@@ -365,32 +365,21 @@ def test_a_coordinate_at_its_limit_has_changed_by_so_much():
     s, update, _ = far_in_depth(0)
     asked = np.zeros(45)
     asked[2] = -2 * s.landmarks.c[0, 2]
-    at = replace(update, camera=replace(s.camera, transports=False)).at(None, asked)
+    at = replace(update, camera=replace(s.camera, transports=False)).linearised(None, asked)
     made = (InverseDepth().moved(s.landmarks.c, asked.reshape(-1, 3)) - s.landmarks.c).reshape(-1)
     assert made[2] > asked[2]
     np.testing.assert_array_equal(at.change[12:], made)
     expected = (update.z - at.z + (at.own @ made.reshape(-1, 3, 1))[:, :, 0]).reshape(-1)
-    np.testing.assert_allclose(at.innovation().nu, expected, atol=1e-9)
+    np.testing.assert_allclose(at.nu, expected, atol=1e-9)
 
 
-def test_what_is_taken_out_was_never_there():
-    """A landmark's distance from what the others predict is the fall of the NIS when it is left out."""
-    s, update = far_off(1)
-
-    def whitened(update: Update, used: np.ndarray) -> Whitened:
-        return gate(update).innovation.whitened(used)
-
-    every, P = whitened(update, np.ones(12, bool)), dense(s.covariance)
-    for gone in ([0], [5], [11], [3, 4, 8]):
-        mask = np.isin(np.arange(12), gone)
-        without = whitened(update, ~mask)
-        if len(gone) == 1:
-            fall = every.w @ every.w - without.w @ without.w
-            assert fall == pytest.approx(every.distances()[gone[0]], rel=1e-6)
-        fresh = whitened(replace(update, z=np.where(mask[:, None], np.nan, update.z)), np.ones(12, bool))
-        np.testing.assert_allclose(without.distances(), fresh.distances(), rtol=1e-6, atol=1e-9)
-        V, W = (np.delete(one.gain_root()[0], np.s_[12 : s.covariance.begin], 0) for one in (without, fresh))
-        np.testing.assert_allclose(in_deviations(V @ V.T, P), in_deviations(W @ W.T, P), atol=1e-9)
+def test_a_distance_is_by_how_much_the_nis_falls_without_a_landmark():
+    _, update = far_off(1)
+    at, whole = gate(update).at, np.ones(12, bool)
+    every = at.solved(whole)
+    for gone in (0, 5, 11):
+        without = at.solved(np.arange(12) != gone)
+        assert every.w @ every.w - without.w @ without.w == pytest.approx(every.distances()[gone], rel=1e-6)
 
 
 @pytest.mark.parametrize("transports", [True, False])
@@ -404,10 +393,10 @@ def test_no_linearisation_measures_a_displacement_of_the_world(coordinates, tran
     there = s.camera.at(s.pose @ se3.exp(np.array([0.05, -0.1, 0.02, 0.5, -0.2, 0.3])))
     for camera in (None, there):
         change = 0.02 * rng.standard_normal((12, 3)) * s.landmarks.c
-        at = update.at(camera, change.reshape(-1))
-        H = np.delete(at.innovation().HP, np.s_[CAMERA:HEAD], axis=1)
+        at = update.linearised(camera, change.reshape(-1))
+        H = np.delete(at.HP, np.s_[CAMERA:HEAD], axis=1)
         U = np.zeros((48, 6))
-        U[:6] = np.linalg.inv((s.camera if transports else at.camera).world())
+        U[:6] = np.linalg.inv((s.camera if transports else at.camera).displacement())
         marks = s.landmarks if transports else s.landmarks.moved(coordinates, slice(None), change)
         U[12:] = marks.gauge.reshape(-1, 6)
         np.testing.assert_allclose(H @ U, 0, atol=1e-7)  # [px/m], [px/rad]

@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 import backends
 from backends.ekf import EkfBackend
+from backends.ekf.motion import EulerCamera
 from backends.iekf import IekfBackend
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
@@ -154,6 +155,15 @@ def test_a_broken_covariance_is_a_status_with_a_reason(drive, entry, where):
     assert len(report.used) == 0
     assert backend.state.covariance is before.covariance and backend.state.landmarks is before.landmarks
     np.testing.assert_array_equal(backend.state.camera, before.camera)
+
+
+def test_a_step_that_runs_away_is_a_status_with_a_reason(drive, monkeypatch):
+    """Far from the prior its error has no numbers there."""
+    backend, seen = predicted(drive, 5)
+    monkeypatch.setattr("backends.ekf.solve._LINEAR", 0.0)
+    monkeypatch.setattr(EulerCamera, "transport", lambda *_: np.zeros((12, 12)))
+    report = backend.update(seen)
+    assert report.status is UpdateStatus.FAILED and report.reason.startswith("ekf: ")
 
 
 @BOTH

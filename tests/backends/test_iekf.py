@@ -58,7 +58,7 @@ def test_the_motion_and_its_derivatives():
 def displacement(camera: InvariantCamera) -> np.ndarray:
     """The error (12, 6) of a camera in a world that is displaced: the invariant error [ξ_p, ξ_R] at the estimate."""
     U = np.zeros((12, 6))
-    U[:6] = np.linalg.inv(camera.world())
+    U[:6] = np.linalg.inv(camera.displacement())
     U[6:9, 3:] = -se3.hat(camera.v)
     return U
 

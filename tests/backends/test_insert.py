@@ -80,6 +80,20 @@ def test_the_camera_is_found_in_a_prior_map_which_becomes_better(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_the_first_poses_prior_counts_as_much_as_the_map(name):
+    """Four landmarks known to 10 cm see it 5 cm off, where it is known to 3 cm; also after a revision."""
+    points = np.array([[-2.0, -1.0, 6.0], [2.0, -1.0, 7.0], [-1.5, 1.2, 6.0], [1.5, 1.0, 5.5]])
+    backend = backends.create(name, RIG, models=models(initial_position_sigma=0.03, initial_rotation_sigma=1e-4))
+    backend.insert(np.arange(4), points, np.tile(0.01 * np.eye(3), (4, 1, 1)))
+    backend.predict(0.0)
+    backend.update(Observations(np.arange(4), *RIG.project(points - [0.05, 0.0, 0.0])))
+    backend.revise(lambda z: z)
+    found = backend.estimate()
+    assert found.T_world_left[0, 3] == pytest.approx(0.05 * 0.03**2 / (0.03**2 + 0.01 / 4), rel=0.1)
+    assert found.covariance[3, 3] == pytest.approx(1 / (1 / 0.03**2 + 4 / 0.01), rel=0.1)
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_what_is_inserted_and_never_seen_stays_as_it_is(name):
     scene = Scene(frames=6)
     backend = backends.create(name, RIG, models=models())

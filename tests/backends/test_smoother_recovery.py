@@ -86,6 +86,15 @@ def test_one_failure_costs_nothing(break_solver, method, error):
     near_the_truth(backend, data)
 
 
+def test_errors_of_our_own_are_not_taken_for_gtsams(monkeypatch):
+    def keep(*_):
+        raise KeyError("ours")
+
+    monkeypatch.setattr("backends.smoother.tracks.Tracks.keep", keep)
+    with pytest.raises(KeyError, match="ours"):
+        run(SmootherBackend(RIG, MODELS), drive(5))
+
+
 # --- a camera that has lost its way is seated again among the landmarks, without a guess ---
 
 

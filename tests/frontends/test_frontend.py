@@ -128,18 +128,3 @@ def test_threshold_keeps_the_number_of_features():
 def test_unusable_images(left, right, says):
     with pytest.raises(SequenceError, match=says):
         SurfFrontend(RIG).extract(StereoFrame(7, 0.0, left, right))
-
-
-def test_without_a_folder_for_the_cache_kernels_still_run(monkeypatch, caplog):
-    from slam.runtime import compilation
-
-    real = compilation.njit
-
-    def no_folder(**options):
-        if options.pop("cache", False):
-            raise RuntimeError("cannot cache function: no locator available")
-        return real(**options)
-
-    monkeypatch.setattr(compilation, "njit", no_folder)
-    assert compilation.kernel(lambda x: x + 1)(2) == 3
-    assert "set NUMBA_CACHE_DIR" in caplog.text

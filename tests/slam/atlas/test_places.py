@@ -1,4 +1,4 @@
-"""A place seen again is the most similar one, and an index keeps what it had when another one grows from it."""
+"""A place seen again is the most similar one."""
 
 from __future__ import annotations
 
@@ -28,17 +28,6 @@ def test_finds_the_place():
     assert index.count == 100
     right = [int(np.argmax(index.similarity(noisy(some, k)))) == k for k, some in enumerate(every)]
     assert np.mean(right) > 0.95
-
-
-def test_two_that_grow_from_one_do_not_disturb_it():
-    every, index = places(40), PlaceIndex()
-    for some in every[:30]:
-        index = index.with_new(some)
-    before = index.similarity(every[3]).copy()
-    index.with_new(every[35])
-    again = index.with_new(every[36])
-    assert (index.similarity(every[3]) == before).all()
-    assert np.argmax(again.similarity(every[36])) == 30
 
 
 def similar_places(count: int) -> np.ndarray:

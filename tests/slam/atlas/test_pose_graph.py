@@ -105,6 +105,15 @@ def test_common_errors_are_found_and_the_covariance_is_right():
     assert np.mean(apart) > 0  # better than with errors that are taken for noise of each step
 
 
+def test_a_motion_has_the_common_errors_in_its_covariance():
+    _, chain, _, _ = problem_with_common_errors(0)
+    _, P = PoseGraph.solved(chain, (), chain.poses, (10, 25)).relative_pose(10, 25)
+    _, expected = chain.motion(10, 25)
+    np.testing.assert_allclose(P, expected, atol=1e-3 * np.abs(expected).max())
+    short = chain.motion(10, 11)[1] - chain.steps[11]
+    assert np.trace(expected) > 15 * np.trace(short)  # they add up
+
+
 def test_a_stretch_that_nothing_is_known_of_is_bridged_by_a_loop():
     true, chain, loops = problem(4)
     steps, odom = chain.steps.copy(), chain.poses.copy()

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import re
 
 import numpy as np
 import pytest
@@ -31,15 +30,8 @@ def test_two_recordings_of_one_rig(made):
     assert all(abs(row["mean"] + 1e-3) < 3 * row["sigma"] for row in turn)
     assert any(abs(row["mean"]) > 1e-4 for row in turn)
     assert tree["agreement"].startswith("The recordings agree")
-    assert all(word in printed for word in ("apart", "roll", "added to measured pixels"))
     assert tree["judgement"] in " ".join(printed.split())
     assert tree["judgement"].startswith("The calibration is off by")
-    model = RigModel(slam.open_sequence(WORLD).rig)
-    factors = {"left_cx": (model.focal, "px"), "right_f": (100, "%"), "left_k1": (1000, "10⁻³"), "yaw": (1000, "mrad")}
-    for row in [row for row in tree["parameters"] if row["name"] in factors]:
-        factor, unit = factors[row["name"]]
-        shown = f"{factor * row['mean']:.2f} ± {factor * row['sigma']:.2f}"
-        assert re.search(rf"{row['name']} +{unit} +{re.escape(shown)} .*± [\d.]+ *\n", printed)  # usual, too
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from slam.commands.display import print_summary
 from slam.compare.plan import Plan, Trial
 from slam.compare.sweep import Run
 from slam.compare.tables import groups, honesty
@@ -94,3 +97,10 @@ def test_runs_that_are_not_to_be_trusted_are_a_row_of_a_comparison_where_there_a
         found = figures(summary(1.0) | {"doubt": doubt})
         (group,) = groups(plan, [Run(trial, "completed", found, {}, tmp_path)])
         assert ("runs not to be trusted [%]" in [metric.title for metric in group.metrics]) == bool(doubt)
+
+
+def test_names_of_back_ends_are_printed_as_they_are(capsys):
+    """`mine:Zero: …` was printed with a picture of the digit."""
+    print_summary([summary(1.0) | {"sequence": "a:fire:[b]", "backend": "mine:Zero"}], [Path("o")])
+    said = capsys.readouterr().out
+    assert "mine:Zero: covariances hold" in said and "a:fire:[b]" in said

@@ -15,7 +15,6 @@ from slam.errors import CalibrationError, ConfigurationError, SlamError
 from slam.sequences import open_sequence
 
 SIZE = (64, 48)
-K = np.array([[50.0, 0, 31.5], [0, 51.0, 23.5], [0, 0, 1]])
 SIDES = ("left", "right")
 
 

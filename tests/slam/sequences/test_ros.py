@@ -11,23 +11,8 @@ import pytest
 import slam
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.sequences.ros_bag import COMPRESSED, INFO, RAW, grey_image
-from tests.bags import (
-    LEFT,
-    R_LEFT,
-    R_RIGHT,
-    RIGHT,
-    STEP,
-    STORES,
-    T0,
-    D,
-    K,
-    compressed,
-    image,
-    info,
-    stereo,
-    write,
-)  # fmt: skip
-from tests.recordings import FIVE, HEIGHT, WIDTH, picture, seeds
+from tests.bags import LEFT, R_LEFT, R_RIGHT, RIGHT, STEP, STORES, T0, D, compressed, image, info, stereo, write
+from tests.recordings import FIVE, HEIGHT, WIDTH, K, picture, seeds
 
 
 @pytest.fixture

@@ -110,7 +110,7 @@ def test_what_is_held_back_is_neither_missed_nor_seen():
 )
 def test_those_seen_once_and_the_longest_unseen_give_way(last_seen, seen, gone):
     surplus = surplus_landmarks(rows_with(last_seen=last_seen, seen=seen), MapConfig(target_in_view=3, max_landmarks=3))
-    assert np.flatnonzero(surplus).tolist() == gone
+    assert surplus.tolist() == gone
 
 
 def test_out_of_view_the_map_is_thinned_to_the_best_seen():

@@ -35,5 +35,7 @@ def test_a_camera_that_something_large_took_along_comes_back(backend):
         results.append(system.process_features(joined(here, ~covered[0], there, covered[1])))
     off = [float(np.linalg.norm(r.estimate.T_world_left[:3, 3])) for r in results]
     assert max(off) > 0.3  # taken along: that it is, others see to
+    sigmas = [float(np.sqrt(np.trace(r.estimate.covariance[3:, 3:]))) for r in results]
+    assert all(error < 3 * sigma for error, sigma in zip(off, sigmas))  # it grows where what fills the view changes
     assert max(off[k] for k, r in enumerate(results) if r.loop == 0) < 0.05
     assert off[-1] < 0.2 * max(off)
