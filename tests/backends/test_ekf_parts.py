@@ -306,7 +306,7 @@ def corrected(s: FilterState, update: Update) -> np.ndarray:
 
 
 def residuals(s: FilterState, update: Update, change: np.ndarray) -> np.ndarray:
-    """Solution: of the prior, whose covariance is diagonal, and of the measurements."""
+    """Whitened: of the prior, whose covariance is diagonal, and of the measurements."""
     z = update.linearised(s.camera.moved(change[:12]), change[12:]).z
     prior = change / np.sqrt(np.diag(dense(s.covariance)))
     return np.concatenate([prior, ((update.z - z) / update.sigma).reshape(-1)])
