@@ -112,7 +112,7 @@ def stretch_nees(
     N, G = _shared(A, [(common[i], common[j]) for i, j in zip(first, last)], N)
     N = 0.5 * (N + np.swapaxes(N, 1, 2))
     usable = np.isfinite(residuals).all(axis=1) & ~doubtful(true, noise, first, last)
-    usable[usable] = _are_covariances(N[usable]) & _are_covariances(_with(N[usable], G[usable]))
+    usable[usable] = are_covariances(N[usable]) & are_covariances(_with(N[usable], G[usable]))
     values = np.full(len(first), np.nan)
     if usable.any():
         N, A, G = N[usable], A[usable], G[usable]
@@ -122,7 +122,7 @@ def stretch_nees(
     return values
 
 
-def _are_covariances(P: Array) -> BoolArray:
+def are_covariances(P: Array) -> BoolArray:
     """Which symmetric matrices (M, 6, 6) are finite and positive definite, also after rounding (M,)."""
     good: BoolArray = np.asarray(np.isfinite(P).all(axis=(1, 2)))
     values = np.linalg.eigvalsh(P[good])

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from slam.data import CommonError, Estimate, FrameResult
-from slam.evaluation.consistency import EXACT, PIXELS_ALONE
+from slam.evaluation.consistency import EXACT, PIXELS_ALONE, are_covariances
 from slam.evaluation.objects import ObjectScore
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import Array
@@ -122,7 +122,7 @@ def results_of(
         logger.warning(
             "the back end's trajectory() lacks %d of %d frames: it needs a pose for each", missing, len(path)
         )
-    none = int((np.linalg.eigvalsh(np.array(record.covariances[1:]).reshape(-1, 6, 6))[:, 0] <= 0).sum())
+    none = int((~are_covariances(np.array(record.covariances[1:]).reshape(-1, 6, 6))).sum())
     if none:
         logger.warning(
             "the back end claims a singular covariance for %d of %d poses: it is no uncertainty", none, len(path)

@@ -189,7 +189,7 @@ def new_landmarks(
         return rows[:0]
     rows = rows[np.argsort(-features.response[rows], kind="stable")]
     uv, size = np.ascontiguousarray(features.uv_left), (left.width, left.height)
-    return births(uv, rows, np.ascontiguousarray(occupied), wanted, float(config.separation), config.grid, size)
+    return births(uv, rows, np.ascontiguousarray(occupied), wanted, float(config.separation), tuple(config.grid), size)
 
 
 def depth_is_known(

@@ -3,7 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from slam.config import SystemConfig
 from slam.data import StereoFeatures
+from slam.system import StereoSlam
 from slam.tracks.config import MapConfig
 from slam.tracks.mapper import MapView, depth_is_known, new_landmarks, surplus_landmarks, take_census
 from slam.tracks.table import LandmarkTable
@@ -25,6 +27,14 @@ def chosen(features, occupied=(), config=CONFIG, free=None):
     free = np.ones(len(features), bool) if free is None else free
     deep = depth_is_known(RIG, features, np.arange(len(features)), 1.0, config.max_depth_error)
     return new_landmarks(features, free & deep, np.asarray(occupied, float).reshape(-1, 2), RIG, config)
+
+
+def test_features_of_uncertain_depth_do_not_become_landmarks():
+    uv = np.stack(np.meshgrid(np.arange(60, 300, 40), np.arange(40, 200, 40)), axis=-1).reshape(-1, 2)
+    far = np.arange(len(uv)) % 2 == 1
+    system = StereoSlam(RIG, None, "ekf", config=SystemConfig(map=MapConfig(target_in_view=40)))
+    system.process_features(features_at(uv, np.where(far, 60.0, 3.0)))
+    assert (system.estimate().positions[:, 2] < 4.0).all() and len(system.landmarks) == (~far).sum()
 
 
 def rows_with(**columns):
