@@ -80,7 +80,7 @@ def print_conclusions(every: Sequence[Group]) -> None:
         _say(f"\n{group.name}", "bold")
         for text in tables.sentences(group):
             _say(text)
-        table = empty_table("", group.runs)
+        table = empty_table("", tables.heads(group))
         for metric in group.metrics:
             if not metric.main:
                 continue

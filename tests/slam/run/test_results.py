@@ -19,7 +19,7 @@ TEN, ONE, START, HUNDRED = "nees_10m_per_dof", "nees_1m_per_dof", "nees_per_dof"
     ("found", "runs", "words"),
     [
         ({}, 1, ""),
-        ({START: 1.0}, 1, "hold: from the start errors of the pose are 1 times what they claim (0.45 to 1.55 in 95 %"),
+        ({START: 1.0}, 1, "hold: from the start errors of the pose are as large as they claim (0.45 to 1.55 in 95 %"),
         ({START: 1.6}, 12, "are too small: from the start errors of the pose are 1.26 times what they claim (0.84"),
         ({START: 0.1}, 1, "are too large: from the start errors of the pose are 0.316 times"),
         ({TEN: 1.2, START: 0.9}, 1, "hold: over 10 m errors of the pose are 1.1 times"),
