@@ -108,7 +108,7 @@ def _say(text: str, style: str | None = None) -> None:
 
 def print_summary(summaries: list[dict[str, Any]], files: Sequence[Path]) -> None:
     """A table of finished runs, a column each, whether their covariances hold, and what was written."""
-    table = empty_table(summaries[0]["sequence"], (summary["backend"] for summary in summaries))
+    table = empty_table(summaries[0]["sequence"].partition("?")[0], (summary["backend"] for summary in summaries))
     for label, values in rows(summaries):
         table.add_row(escape(label), *values)
     _console.print(table)

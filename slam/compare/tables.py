@@ -166,7 +166,7 @@ def distance_apart(reference: Sequence[Run], other: Sequence[Run]) -> float:
     """RMS distance [m] between the final paths of two back ends, which begin together; NaN where there are none."""
     squares: list[float] = []
     for runs in zip(reference, other):
-        if all(run.completed for run in runs):
+        if all(run.trusted for run in runs):
             paths = [RunData.read(run.folder, "").final for run in runs]
             rows = pair(paths[0].stamps, paths[1].stamps, 1e-6)
             between = (paths[0].positions - paths[1].positions[rows])[rows >= 0]

@@ -61,7 +61,7 @@ def number(value: float, like: float | None = None) -> str:
     return text.replace("-", "−")
 
 
-#: Whether a run's path cannot be trusted.
+#: Whether a run's path cannot be trusted, or no frame after the first was tracked.
 DOUBTED = "doubted"
 
 #: In the order of all tables. Times are not compared: they differ from run to run.
@@ -128,6 +128,7 @@ _NEES = {
     "nees_100m_per_dof": "over 100 m",
 }
 _KEYS = {over: key for key, over in _NEES.items()}
+_OF_A_PATH = {"loops_closed", "path_m", "speed", "sigma_m"}
 _FEW = 0.5  # a NEES over less than this share of the stretches is no figure: they are hardly a fair choice
 
 
@@ -144,11 +145,12 @@ def figures(summary: Mapping[str, Any]) -> dict[str, float]:
             found[m.key] = float(np.mean(known)) / (6 if "nees" in m.key else 1)
     if frames := summary.get("frames", 0):
         found["tracked"] = _measured(summary) / frames
-    found[DOUBTED] = float(bool(summary.get("doubt")))
+    followed = bool((summary.get("status") or {}).get("tracked"))
+    found[DOUBTED] = float(bool(summary.get("doubt")) or (frames > 1 and not followed))
     if ratios := _ratios(found):
         found["ratio"] = next(iter(ratios.values()))
-    if not (summary.get("status") or {}).get("tracked"):  # loops of poses that are the motion model's are none
-        found.pop("loops_closed", None)
+    if not followed:  # poses that are the motion model's have no loops, path or σ
+        found = {key: value for key, value in found.items() if key not in _OF_A_PATH}
     if not found.get("loops_closed") and not found.get("loops_refused"):
         found = {key: value for key, value in found.items() if not key.startswith("loops")}
     return found

@@ -20,7 +20,6 @@ from slam.errors import (
     PartError,
     SequenceError,
     SlamError,
-    TrajectoryError,
     UnknownNameError,
     cause,
 )
@@ -142,17 +141,11 @@ def _open_folder(text: str, format: str | None, quiet: bool) -> RecordedSequence
 
 
 def _truth(path: Path, stamps: Array) -> Trajectory:
-    """The left camera's true path in TUM's form; SequenceError where it is none, or of other times than the images."""
-    try:
-        truth = require_truth(Trajectory.read_tum(path), path)
-    except TrajectoryError as error:
-        raise SequenceError(str(error)) from error
+    """The left camera's true path in TUM's form; SlamError where it is none, or of other times than the images."""
+    truth = require_truth(Trajectory.read_tum(path), path)
     if (pair(truth.stamps, stamps, _NEAR) < 0).all():
-        spans = (
-            f"{of} from {times[0]:.3f} to {times[-1]:.3f} s"
-            for of, times in (("it is", truth.stamps), ("they are", stamps))
-        )
-        raise SequenceError(f"{path}: no pose is within {_NEAR:g} s of an image: {', '.join(spans)}")
+        ends = (f"{times[0]:.3f} to {times[-1]:.3f} s" for times in (truth.stamps, stamps))
+        raise SequenceError(f"{path}: no pose is within {_NEAR:g} s of an image: {', images are from '.join(ends)}")
     return truth
 
 

@@ -93,8 +93,9 @@ def test_figures_of_bodies_are_means_over_those_that_were_in_view():
 
 def test_runs_that_are_not_to_be_trusted_are_a_row_of_a_comparison_where_there_are_any(tmp_path):
     plan, trial = Plan(("synthetic:desk",), ("ekf",)), Trial("synthetic:desk", "ekf")
-    for doubt in ("", "rows do not agree"):
-        found = figures(summary(1.0) | {"doubt": doubt})
+    lost = {"status": {"started": 1, "lost": 39}}
+    for doubt in ({}, {"doubt": "rows do not agree"}, lost):
+        found = figures(summary(1.0) | doubt)
         (group,) = groups(plan, [Run(trial, "completed", found, {}, tmp_path)])
         assert ("runs not to be trusted [%]" in [metric.title for metric in group.metrics]) == bool(doubt)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import slam
-from slam.errors import CalibrationError, SequenceError
+from slam.errors import CalibrationError, SequenceError, SlamError
 from slam.input.features import outside_masks
 from slam.sequences import open_sequence, with_mask
 from tests import recordings
@@ -304,5 +304,5 @@ def test_a_true_path_is_given_by_an_option(two_folders: Path) -> None:
     np.testing.assert_allclose(found.poses, truth.poses, atol=1e-8)
     slam.Trajectory(stamps + 1e6, truth.poses).write_tum(two_folders / "late.txt")
     for name, line in (("late.txt", "no pose is within"), ("none.txt", "none.txt")):
-        with pytest.raises(SequenceError, match=line):
+        with pytest.raises(SlamError, match=line):
             open_sequence(f"{two_folders}?truth={name}")
