@@ -104,8 +104,8 @@ def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
                 return None
             tried[trial.sequence] = result["milliseconds"]
         times = tried[trial.sequence]
-        spent = times.get("total", 0.0)
-        if trial.mode != CLOSED_LOOP:  # a replay: without images
-            spent -= times.get("read", 0.0) + times.get("extract", 0.0)
-        seconds += 1e-3 * frames[trial.sequence] * spent
+        images = (
+            times.get("read", 0.0) + times.get("extract", 0.0) if trial.mode != CLOSED_LOOP else 0.0
+        )  # of no replay
+        seconds += 1e-3 * frames[trial.sequence] * (times.get("total", 0.0) - images)
     return seconds
