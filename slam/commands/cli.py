@@ -253,7 +253,10 @@ def compare_command(
     masked, names = (with_mask(text, mask) for text in sequences), filter(None, backends.split(","))
     start, stop = parse_frames(frames)
     plan = Plan(tuple(masked), tuple(names), frontend, tuple(settings or ()), trials, start, stop, replay)
-    command.compare(plan, out, workers, quiet, overwrite, command_line())
+    runs = command.compare(plan, out, workers, quiet, overwrite, command_line())
+    if not any(run.trusted for run in runs):
+        print("slam: no run can be trusted: each failed, or its path is doubted", file=sys.stderr)
+        raise typer.Exit(1)
 
 
 @app.command("calibrate", short_help="Find a stereo rig's error from its recordings.")

@@ -16,10 +16,11 @@ from slam.compare.trial import COMPLETED, RESULT
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
 from slam.files import read_object
+from slam.naming import count as count_of
 from slam.runtime.threads import available_cores
 from slam.settings import require_settable
 
-_NAMED = 3  # failed runs whose reasons are printed; the report has all
+_NAMED = 5  # lines on failed and doubted runs, and their warnings, that are printed; the report has all
 _TRIED = 15  # frames by which the time of a comparison is told
 
 
@@ -59,7 +60,7 @@ def compare(
     total, done = sum(frames[trial.sequence] for trial in plan.every), 0
     limits = caution(plan, plan.trials if any(map(is_world, plan.sequences)) else 1)
     if not quiet:
-        left = [trial for trial in plan.every if overwrite or not is_done(trial, out)]
+        left = [trial for trial in plan.every if overwrite or not is_done(plan, trial, out)]
         before = f", {len(plan.every) - len(left)} of them done before" if len(left) < len(plan.every) else ""
         seconds = _seconds(left, frames) if left else None
         about = "" if seconds is None else f": about {seconds / min(count, len(left)):.0f} s, by the first frames"
@@ -79,8 +80,12 @@ def compare(
     if not quiet:
         print_conclusions(every)
         failed = [run for run in runs if not run.completed]
-        for run in failed[:_NAMED]:
-            print(f"{run.trial.backend}, seed {run.trial.seed}: {run.outcome}")
+        told: dict[str, list[Run]] = {}
+        for run in runs:
+            for text in run.said if run.completed else [run.outcome]:
+                told.setdefault(f"{run.trial.sequence}: {text}", []).append(run)
+        for text, own in list(told.items())[:_NAMED]:
+            print(f"{text} ({', '.join(dict.fromkeys(run.trial.backend for run in own))}, {count_of(len(own), 'run')})")
         print(f"Runs: {len(runs)}, {len(failed)} failed. Report: {report}")
     return runs
 
@@ -99,8 +104,8 @@ def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
                 return None
             tried[trial.sequence] = result["milliseconds"]
         times = tried[trial.sequence]
-        spent = times.get("total", 0.0)
-        if trial.mode != CLOSED_LOOP:  # a replay: without images
-            spent -= times.get("read", 0.0) + times.get("extract", 0.0)
-        seconds += 1e-3 * frames[trial.sequence] * spent
+        images = (
+            times.get("read", 0.0) + times.get("extract", 0.0) if trial.mode != CLOSED_LOOP else 0.0
+        )  # of no replay
+        seconds += 1e-3 * frames[trial.sequence] * (times.get("total", 0.0) - images)
     return seconds

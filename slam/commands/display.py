@@ -80,7 +80,7 @@ def print_conclusions(every: Sequence[Group]) -> None:
         _say(f"\n{group.name}", "bold")
         for text in tables.sentences(group):
             _say(text)
-        table = empty_table("", group.runs)
+        table = empty_table("", tables.heads(group))
         for metric in group.metrics:
             if not metric.main:
                 continue
@@ -108,7 +108,7 @@ def _say(text: str, style: str | None = None) -> None:
 
 def print_summary(summaries: list[dict[str, Any]], files: Sequence[Path]) -> None:
     """A table of finished runs, a column each, whether their covariances hold, and what was written."""
-    table = empty_table(summaries[0]["sequence"], (summary["backend"] for summary in summaries))
+    table = empty_table(summaries[0]["sequence"].partition("?")[0], (summary["backend"] for summary in summaries))
     for label, values in rows(summaries):
         table.add_row(escape(label), *values)
     _console.print(table)

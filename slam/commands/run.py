@@ -73,26 +73,27 @@ def frame_count(sequence: StereoSequence, start: int, stop: int | None) -> int |
 def finish(summary: dict[str, Any], written: Sequence[Output], picture: bool, quiet: bool) -> None:
     """Leave the picture of a run and print its table, its files, and a line where many frames were not tracked.
 
-    The first of `written` is its folder. The exit status is 1 where no frame was tracked, none was run, or the path
-    cannot be trusted, which the last line says.
+    The first of `written` is its folder. The exit status is 1 where no frame was tracked, none was run, the path cannot
+    be trusted, or no recording could be made, which the last line says.
     """
     folder, drawn = written[0].path, "path_length_m" in summary  # where a frame has a pose
     if not summary["frames"]:
         print(f"slam: the run ended before its first frame; files: {folder}", file=sys.stderr)
         raise typer.Exit(1)
+    missing = [output for output in written if output.option == "--record" and not output.present]
     if picture and drawn:
         leave_picture(folder)
     if not quiet:
-        print_summary([summary], [output.path for output in written])
+        print_summary([summary], [output.path for output in written if output not in missing])
     if summary["tracking"]:
         no_picture = "; no picture: no frame has a pose" if picture and not drawn else ""
         print(f"slam: {summary['tracking']}{no_picture}", file=sys.stderr)
-    if doubt := summary.get("doubt"):
-        if not summary["tracking"]:
-            red = ("\x1b[31m", "\x1b[0m") if sys.stderr.isatty() else ("", "")
-            print(f"{red[0]}slam: do not trust this path: {doubt}{red[1]}", file=sys.stderr)
-        raise typer.Exit(1)
-    if summary["frames"] > 1 and not summary["status"].get("tracked"):
+    elif doubt := summary.get("doubt"):
+        red = ("\x1b[31m", "\x1b[0m") if sys.stderr.isatty() else ("", "")
+        print(f"{red[0]}slam: do not trust this path: {doubt}{red[1]}", file=sys.stderr)
+    for output in missing:
+        print(f"slam: {output.path}: not written, as the warning above says", file=sys.stderr)
+    if summary.get("doubt") or missing or (summary["frames"] > 1 and not summary["status"].get("tracked")):
         raise typer.Exit(1)
 
 

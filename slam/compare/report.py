@@ -17,17 +17,13 @@ from slam.compare.sweep import Run
 from slam.compare.tables import Group
 from slam.files import write_text
 from slam.run.options import versions
-from slam.run.plots import backend_colours, drawn
-from slam.run.results import BY_KEY
+from slam.run.plots import drawn
 from slam.run.run_data import RunData
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TEMPLATES = Path(__file__).parent / "templates"
-
-_MOST_TICKS = 15
-_WIDTH = 5.2  # [in] about that of a phone: text stays readable where the picture fills the screen
 
 
 def write_report(
@@ -77,33 +73,10 @@ def _pictures(group: Group) -> Iterator[tuple[str, str]]:
     trial, known = shown[0].trial, {metric.key for metric in group.metrics}
     runs = [RunData.read(run.folder, run.trial.backend) for run in shown]
     of_seed = f", seed {trial.seed}" if is_world(trial.sequence) else ""
-    if "ate_online_m" in known and group.trials > 1:
-        text = "Online path error (ATE, aligned) of every trial; lines join runs on the same recording."
-        yield text, _svg(_pairs(group))
     yield f"Paths{of_seed}.", _svg(drawn(runs, "path"))
     if "nees_per_dof" in known:
         text = f"Error of the pose{of_seed} (solid), and the σ that each back end claims (dashed)."
         yield text, _svg(drawn(runs, "errors"))
-
-
-def _pairs(group: Group) -> Figure:
-    """Each trial's errors, those of the back ends side by side and joined: whether differences are of one sign."""
-    from matplotlib.figure import Figure
-
-    metric = BY_KEY["ate_online_m"]
-    figure = Figure((_WIDTH, 2.6), layout="constrained")
-    axis = figure.subplots()
-    values = np.array([metric.scale * group.values(name, metric.key) for name in group.runs])
-    backends, trials = values.shape
-    x = np.arange(trials) + np.linspace(-0.25, 0.25, backends)[:, None]
-    axis.plot(x, values, color="0.7", lw=1, zorder=1)
-    for at, value, name, colour in zip(x, values, group.runs, backend_colours(list(group.runs))):
-        axis.plot(at, value, "o", color=colour, ms=4, alpha=0.8, label=name)
-    axis.set(xlim=(-0.5, trials - 0.5), xticks=range(0, trials, -(-trials // _MOST_TICKS)))
-    axis.set(xlabel="seed", ylabel=f"online ATE [{metric.unit}]", ylim=(0, 1.08 * np.nanmax(values, initial=1e-9)))
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(frameon=False, fontsize=8, ncols=3, loc="lower left", bbox_to_anchor=(0, 1.0))  # where it hides nothing
-    return figure
 
 
 def _svg(figure: Figure) -> str:

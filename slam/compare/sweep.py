@@ -6,6 +6,7 @@ A trial's folder is its own checkpoint: ``result.json`` is written last.
 from __future__ import annotations
 
 import json
+import logging
 import multiprocessing
 import os
 import signal
@@ -25,6 +26,7 @@ from slam.input.features import Rectification
 from slam.outputs import Output, require_outputs
 from slam.run.options import versions
 from slam.run.outputs import naming_folder, write_json
+from slam.run.results import DOUBTED
 from slam.sequences import open_sequence
 
 RUNS, SWEEP = "runs", "sweep.json"
@@ -44,11 +46,17 @@ class Run:
     metrics: dict[str, float]  # figures by key of `slam.run.results.METRICS`; none where it failed
     milliseconds: dict[str, float]  # median per stage
     folder: Path  # its files
+    said: tuple[str, ...] = ()  # likely cause of lost frames, doubt, warnings
 
     @property
     def completed(self) -> bool:
         """Whether it came to its end."""
         return self.outcome == COMPLETED
+
+    @property
+    def trusted(self) -> bool:
+        """Whether it came to its end, and its path is not doubted."""
+        return self.completed and not self.metrics.get(DOUBTED)
 
 
 def sweep(
@@ -73,14 +81,10 @@ def sweep(
     for mode in plan.modes:  # a replay needs the closed loop
         jobs: list[Job] = []
         for trial in plan.trials_of(mode):
-            if not overwrite and is_done(trial, out):
+            if not overwrite and is_done(plan, trial, out):
                 told(trial)
-                continue
-            recording = None
-            if mode == REPLAY:  # of the first back end's run
-                given = read_run(replace(trial, backend=plan.backends[0], mode=CLOSED_LOOP), out)
-                recording = given.folder / RECORDING if given.completed else None
-            jobs.append((trial, out / RUNS / trial.folder, recording))
+            else:
+                jobs.append((trial, out / RUNS / trial.folder, _recording(plan, trial, out)))
         run_jobs(jobs, workers, told)
     return [read_run(trial, out) for trial in plan.every]
 
@@ -115,9 +119,13 @@ def run_jobs(jobs: Sequence[Job], workers: int, told: Callable[[Trial], None]) -
 
 
 def _begin_worker() -> None:
-    """Leave interrupts to the parent, end when it is gone, however it went, and do not compete with the others."""
+    """Leave interrupts to the parent, end when it is gone, however it went, and do not compete with the others.
+
+    Warnings are kept in a run's `RESULT`: here they would name neither recording nor run.
+    """
     import cv2
 
+    logging.getLogger("slam").setLevel(logging.ERROR)
     cv2.setNumThreads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -164,16 +172,30 @@ def read_run(trial: Trial, out: Path) -> Run:
         metrics, milliseconds = (
             {name: float(value) for name, value in result[key].items()} for key in ("metrics", "milliseconds")
         )
-        return Run(trial, str(result["outcome"]), metrics, milliseconds, folder)
+        said = tuple(map(str, result.get("said", ())))
+        return Run(trial, str(result["outcome"]), metrics, milliseconds, folder, said)
     except (KeyError, AttributeError, TypeError, ValueError, OverflowError) as error:
         raise SlamError(f"{folder / RESULT}: does not say how the run ended: {error!r}") from error
 
 
-def is_done(trial: Trial, out: Path) -> bool:
-    """Whether the trial has ended before, with these settings, frames and versions, which no folder's name tells."""
+def _recording(plan: Plan, trial: Trial, out: Path) -> Path | None:
+    """The file that replays take, and the first back end's closed loop leaves for them; None for the other runs."""
+    given = replace(trial, backend=plan.backends[0], mode=CLOSED_LOOP)
+    needed = plan.replay and (trial.mode == REPLAY or trial == given)
+    return out / RUNS / given.folder / RECORDING if needed else None
+
+
+def is_done(plan: Plan, trial: Trial, out: Path) -> bool:
+    """Whether the trial has ended before, with these settings, frames and versions, which no folder's name tells.
+
+    A closed loop that a replay needs, and was run without one, is not done.
+    """
     try:
-        read_run(trial, out)
+        run = read_run(trial, out)
         before = read_object(out / RUNS / trial.folder / RESULT)
     except SlamError:
+        return False
+    recording = _recording(plan, trial, out) if run.completed and trial.mode == CLOSED_LOOP else None
+    if recording is not None and not recording.is_file():
         return False
     return bool(before.get("versions") == versions() and before.get("trial") == json.loads(json.dumps(asdict(trial))))

@@ -17,8 +17,10 @@ from slam.compare.statistics import Difference, difference, reach
 from slam.compare.sweep import Run
 from slam.files import write_text
 from slam.geometry.se3 import Array
+from slam.geometry.stamps import pair
 from slam.run.outputs import csv_number, csv_rows
 from slam.run.results import COMPARED, DOUBTED, Metric, number, verdict
+from slam.run.run_data import RunData
 
 DIFFERENCE_COLUMNS = (
     "sequence", "mode", "figure", "reference", "other", "pairs", "missing", "mean_reference", "mean_other",
@@ -52,7 +54,14 @@ class Group:
     def metrics(self) -> list[Metric]:
         """The figures that at least one run has; no word of doubt where there is none."""
         every = [run.metrics for runs in self.runs.values() for run in runs]
-        return [m for m in COMPARED if any(m.key in found and (m.key != DOUBTED or found[m.key]) for found in every)]
+        spare = {"path_m"} if self.has_truth else set()
+        known = [m for m in COMPARED if m.key not in spare and any(m.key in found for found in every)]
+        return [m for m in known if m.key != DOUBTED or any(found.get(DOUBTED) for found in every)]
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether a true path is known."""
+        return any("ate_online_m" in run.metrics for runs in self.runs.values() for run in runs)
 
     def values(self, backend: str, key: str) -> Array:
         """A figure by trial (N,), NaN where the run failed or has none."""
@@ -126,21 +135,50 @@ def row(group: Group, metric: Metric) -> list[dict[str, str]]:
     return cells
 
 
-def sentences(group: Group) -> list[str]:
-    """`in_short` of each back end but the first, and the runs that failed, if any."""
+def heads(group: Group) -> list[str]:
+    """Names of the back ends for the head of a table; the one that others are compared with is marked."""
     first, *others = group.runs
-    found = [in_short([group.compared[m.key][other] for m in group.metrics], first, other) for other in others]
+    return [f"{first} (reference)" if others else first, *others]
+
+
+def sentences(group: Group) -> list[str]:
+    """`in_short` of each back end but the first, or how far they are apart without truth, and the runs that failed."""
+    first, *others = group.runs
+    found = []
+    if all(group.failures(backend) == group.trials for backend in group.runs):
+        found.append("No run completed.")
+    elif not group.has_truth:
+        found.append("No true path is known (see the option truth=FILE): nothing tells which path is better.")
+        apart = ((other, distance_apart(group.runs[first], group.runs[other])) for other in others)
+        found += [
+            f"Final paths of {first} and {other} are {number(1e3 * d)} mm apart (RMS)." for other, d in apart if d >= 0
+        ]
+    else:
+        judged = [other for other in others if group.trials not in (group.failures(first), group.failures(other))]
+        found = [in_short([group.compared[m.key][other] for m in group.metrics], first, other) for other in judged]
     if counts := [f"{n} of {group.trials} of {backend}" for backend in group.runs if (n := group.failures(backend))]:
         failed = "a trial in which either failed is no pair, and is in no other figure."
         found.append(f"Runs failed, {', '.join(counts)}: {failed}")
     return found
 
 
+def distance_apart(reference: Sequence[Run], other: Sequence[Run]) -> float:
+    """RMS distance [m] between the final paths of two back ends, which begin together; NaN where there are none."""
+    squares: list[float] = []
+    for runs in zip(reference, other):
+        if all(run.trusted for run in runs):
+            paths = [RunData.read(run.folder, "").final for run in runs]
+            rows = pair(paths[0].stamps, paths[1].stamps, 1e-6)
+            between = (paths[0].positions - paths[1].positions[rows])[rows >= 0]
+            squares += np.sum(between**2, axis=1).tolist()
+    return float(np.sqrt(np.mean(squares))) if squares else float("nan")
+
+
 def in_short(differences: Sequence[Difference], reference: str, other: str) -> str:
-    """Which of two back ends is better in what, in one sentence: in the main figures that can be told apart."""
+    """Which of two back ends is better in what, in one sentence: in all figures that can be told apart."""
     parts = []
     for word, first, second in (("better", other, reference), ("worse", reference, other)):
-        names = [d.metric.label.partition(" (")[0] for d in differences if d.metric.main and d.verdict == word]
+        names = [d.metric.label.partition(" (")[0] for d in differences if d.verdict == word]
         if names:
             parts.append(f"{first} is better than {second} in {', '.join(names)}")
     return f"{'; '.join(parts) or f'No difference between {reference} and {other} can be concluded'}."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,8 @@ from slam.run.results import figures
 from slam.run.run_data import RunData
 from slam.run.runner import run, run_recording
 from slam.run.summary import RunRecord
-from slam.sequences import Sequence, open_sequence
+from slam.sequences import Sequence as StereoSequence
+from slam.sequences import open_sequence
 from slam.worlds import WorldSequence
 
 RESULT, RECORDING = "result.json", "recording.npz"
@@ -42,12 +43,16 @@ def run_trial(trial: Trial, folder: Path, recording: Path | None = None) -> None
     """Run a trial; its files are left in `folder`, `RESULT` last: what is there then is whole.
 
     Bad input, failures of the estimator and defects of a program are an outcome, kept with the frames done so far. A
-    replay takes the measurements of `recording`; a closed loop leaves its own as `RECORDING`.
+    replay takes the measurements of `recording`; a closed loop leaves its own there, if it is to.
     """
-    remove_file(folder / RESULT)
+    own = recording if trial.mode == CLOSED_LOOP else None
+    for path in filter(None, (folder / RESULT, own)):
+        remove_file(path)
     try:
         keep_result(trial, folder, COMPLETED, *_run(trial, recording, folder))
     except Exception as error:  # noqa: BLE001 (not every exception gets from a worker to the parent)
+        if own is not None:
+            remove_file(own)  # of half a run
         keep_result(trial, folder, error)
 
 
@@ -57,6 +62,7 @@ def keep_result(
     outcome: str | BaseException,
     metrics: Mapping[str, float] | None = None,
     milliseconds: Mapping[str, float] | None = None,
+    said: Sequence[str] = (),
 ) -> None:
     """Write how a trial ended, also where an exception ended it, and its figures; one that is no number is none."""
     if isinstance(outcome, BaseException):
@@ -66,10 +72,10 @@ def keep_result(
     with naming_folder(folder):
         folder.mkdir(parents=True, exist_ok=True)
     result = {"trial": asdict(trial), "versions": versions(), "outcome": outcome, "metrics": found}
-    write_json(folder / RESULT, result | {"milliseconds": milliseconds or {}})
+    write_json(folder / RESULT, result | {"milliseconds": milliseconds or {}, "said": list(said)})
 
 
-def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:
+def config_of(trial: Trial, sequence: StereoSequence) -> SystemConfig:
     """All settings of a trial; raises ConfigurationError: a setting is unknown or out of range."""
     name, first = trial.frontend, list[str]()
     if name == "surf":
@@ -105,30 +111,35 @@ class _Simulated:
         return self._world.observations(frame.index)
 
 
-def _run(trial: Trial, recording: Path | None, out: Path) -> tuple[dict[str, float], dict[str, float]]:
-    """The whole system on the sequence, whose measurements are recorded; or a back end alone on recorded ones.
+def _run(trial: Trial, recording: Path | None, out: Path) -> tuple[dict[str, float], dict[str, float], list[str]]:
+    """The whole system on the sequence, or a back end alone on recorded measurements.
 
-    Returns figures, and median times of stages [ms].
+    Returns figures, median times of stages [ms], and what is said of the run: likely cause, doubt and warnings.
     """
     closed, record = trial.mode == CLOSED_LOOP, RunRecord()
-    if not closed and recording is None:
-        raise SlamError(f"{trial.source}: the run to be replayed has failed, there are no measurements")
+    if not closed and (recording is None or not recording.is_file()):
+        why = "the run to be replayed failed, or lost its camera and began again"
+        raise SlamError(f"{trial.source}: {why}: there are no measurements of one back end")
     sequence = open_sequence(trial.source, quiet=True)  # `slam.compare.sweep.check` has said what it says
+    opening = list(sequence.warnings)
     collected = MapRecord(sequence, trial.start, closed)
     config = config_of(trial, sequence)
     options = RunOptions(trial.backend, trial.frontend, config, out, kind=sequence.kind)
-    if recording is not None:
+    if not closed and recording is not None:
         summary = run_recording(load_recording(recording), options, collected.add, record)
     else:
         simulated = _Simulated(sequence) if trial.frontend == SIMULATED else None  # type: ignore[arg-type]
-        options = replace(options, start=trial.start, stop=trial.stop, record=out / RECORDING)
+        options = replace(options, start=trial.start, stop=trial.stop, record=recording)
         summary = run(sequence if simulated is None else simulated, options, collected.add, simulated, record=record)
     if not summary["frames"]:
         raise SlamError("the run has no frame")
     times = summary.get("milliseconds", {"median": {}})
     milliseconds = {stage: value for stage, value in times["median"].items() if value}
     milliseconds |= {"total": times["median_total"]} if milliseconds else {}
-    return figures(summary) | collected.figures(record, out), milliseconds
+    said = [text for text in (summary["tracking"], summary["doubt"]) if text]
+    said += [text for text in summary["warnings"] if text not in opening]
+    alone = [text for at, text in enumerate(said) if not any(text in before for before in said[:at])]
+    return figures(summary) | collected.figures(record, out), milliseconds, alone
 
 
 # --------------------------------------------------------------------------------- what only a comparison measures
@@ -140,7 +151,7 @@ class MapRecord:
     `start` is the number of the first frame. Associations of a replay are the same for all, and need no check.
     """
 
-    def __init__(self, sequence: Sequence, start: int = 0, associations: bool = True) -> None:
+    def __init__(self, sequence: StereoSequence, start: int = 0, associations: bool = True) -> None:
         self._sequence, self._start, self._associations = sequence, start, associations
         self._truth = SurfacePoints(sequence) if sequence.format == "synthetic" else None
         self._sizes: list[int] = []

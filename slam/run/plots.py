@@ -163,7 +163,7 @@ def _title(runs: Sequence[RunData]) -> str:
     lost = {run.name: sum(status != "tracked" for status in run.status[1:]) for run in runs}
     frames = f"{' and '.join(dict.fromkeys(str(len(run.status)) for run in runs))} frames"
     frames += "".join(f"; {name}: {count} not tracked" for name, count in lost.items() if count)
-    return f"{runs[0].sequence}: {frames}"
+    return f"{runs[0].sequence.partition('?')[0]}: {frames}"
 
 
 # ------------------------------------------------------------------------------------------------ path and map
@@ -217,6 +217,8 @@ def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
     across, ahead = (f"{('right', 'up', 'forward')[k]} [{unit}]" for k in shown)
     view = "above" if shown[1] == 2 else "the side"
     axis.set(title=f"Path from {view}, online (dot: start)", xlabel=across, ylabel=ahead)
+    if not extent.any():
+        axis.set(xlim=(-1, 1), ylim=(-1, 1))
     axis.set_aspect("equal", adjustable="datalim")
     axis.legend(framealpha=0.8)
     axis.locator_params(axis="x", nbins=6)

@@ -61,7 +61,7 @@ def number(value: float, like: float | None = None) -> str:
     return text.replace("-", "−")
 
 
-#: Whether a run's path cannot be trusted.
+#: Whether a run's path cannot be trusted, or no frame after the first was tracked.
 DOUBTED = "doubted"
 
 #: In the order of all tables. Times are not compared: they differ from run to run.
@@ -69,7 +69,7 @@ METRICS = (
     Metric("completed", "runs completed", "%", "", "higher", "compared main"),
     Metric("tracked", "frames tracked", "%", "", "higher", "compared main"),
     Metric(DOUBTED, "runs not to be trusted", "%", "", "lower", "compared main"),
-    Metric("path_m", "path length", "m", "path_length_m", shown="run picture"),
+    Metric("path_m", "path length", "m", "path_length_m", shown="compared main run picture"),
     Metric("speed", "speed, median", "m/s", "speed_m_per_s", shown="run picture"),
     Metric("landmarks", "landmarks in the map at the end", "", "landmarks", shown="run"),
     Metric("bodies", "moving bodies found", "", "bodies", shown="run picture"),
@@ -87,10 +87,11 @@ METRICS = (
            "compared main run picture brief"),
     Metric("ate_final_m", "final path error (ATE, aligned)", "mm", "accuracy/final/ATE RMSE [m]", "lower",
            "compared main run brief"),
-    Metric("rpe_1s_m", "drift in 1 s (RPE)", "mm", "accuracy/online/RPE RMSE over 1 s [m]", "lower", "compared run"),
-    Metric("rpe_1s_deg", "drift in 1 s, rotation (RPE)", "deg", "accuracy/online/RPE rotation RMSE over 1 s [deg]",
-           "lower"),
-    Metric("segment_percent", "drift by distance (RPE)", "%", "accuracy/online/segment error [%]", "lower",
+    Metric("rpe_1s_m", "online drift in 1 s (RPE)", "mm", "accuracy/online/RPE RMSE over 1 s [m]", "lower",
+           "compared run"),
+    Metric("rpe_1s_deg", "online drift in 1 s, rotation (RPE)", "deg",
+           "accuracy/online/RPE rotation RMSE over 1 s [deg]", "lower"),
+    Metric("segment_percent", "online drift by distance (RPE)", "%", "accuracy/online/segment error [%]", "lower",
            "compared run"),
     Metric("sigma_m", "claimed σ of the last position", "mm", "final_sigma_m", shown="run picture brief"),
     Metric("ratio", "errors over claimed σ (1 is right)", shown="run"),
@@ -127,6 +128,7 @@ _NEES = {
     "nees_100m_per_dof": "over 100 m",
 }
 _KEYS = {over: key for key, over in _NEES.items()}
+_OF_A_PATH = {"loops_closed", "path_m", "speed", "sigma_m"}
 _FEW = 0.5  # a NEES over less than this share of the stretches is no figure: they are hardly a fair choice
 
 
@@ -143,11 +145,12 @@ def figures(summary: Mapping[str, Any]) -> dict[str, float]:
             found[m.key] = float(np.mean(known)) / (6 if "nees" in m.key else 1)
     if frames := summary.get("frames", 0):
         found["tracked"] = _measured(summary) / frames
-    found[DOUBTED] = float(bool(summary.get("doubt")))
+    followed = bool((summary.get("status") or {}).get("tracked"))
+    found[DOUBTED] = float(bool(summary.get("doubt")) or (frames > 1 and not followed))
     if ratios := _ratios(found):
         found["ratio"] = next(iter(ratios.values()))
-    if not (summary.get("status") or {}).get("tracked"):  # loops of poses that are the motion model's are none
-        found.pop("loops_closed", None)
+    if not followed:  # poses that are the motion model's have no loops, path or σ
+        found = {key: value for key, value in found.items() if key not in _OF_A_PATH}
     if not found.get("loops_closed") and not found.get("loops_refused"):
         found = {key: value for key, value in found.items() if not key.startswith("loops")}
     return found
@@ -217,7 +220,8 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     if said[judged] != "right":
         word = "are on the safe side" if exact else f"are {said[judged]}"
     of = "runs" if runs == 1 else f"means of {runs} runs"
-    times = f"{judged} errors of the pose are {number(ratio)} times what they claim"
+    times = "as large as" if number(ratio) == "1" else f"{number(ratio)} times what"
+    times = f"{judged} errors of the pose are {times} they claim"
     band = f"({low:.2f} to {high:.2f} in 95 % of {of})"
     if exact:
         others.append("they count errors of the calibration, and this world's cameras have none")

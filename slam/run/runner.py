@@ -18,6 +18,7 @@ from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError, one_line, text_of
 from slam.evaluation.objects import labels_in_images, score_for
 from slam.evaluation.summary import with_truth
+from slam.files import remove_file
 from slam.geometry.trajectory import Trajectory
 from slam.input.features import Rectification
 from slam.interfaces import Frontend
@@ -56,7 +57,7 @@ def run(
     The files are completed however the run ends: on an error or an interrupt the frames done so far are kept, the
     summary says how it ended, recording and map are written, and the exception goes on; before the first frame is done
     it leaves no file. Where a file cannot be written the others are; of several errors the first one is raised. Files
-    of an earlier run in the folder are replaced.
+    of an earlier run in the folder are replaced. A run in which a new back end took over leaves no recording.
 
     Args:
         sequence: what to run.
@@ -238,13 +239,13 @@ class _Run:
             attempt(write_json, out / "summary.json", summary)
 
     def _save_recording(self, path: Path) -> None:
-        """Write what was given to the back end of a run; raises SlamError where it was given to more than one."""
+        """Write what was given to the back end of a run; where it was given to more than one, warn instead."""
         sequence, models = self.sequence, self.options.config.models
         if isinstance(self.system, StereoSlam) and self.system.restarted:
-            raise SlamError(
-                f"{path}: not written: the camera was lost, and a new back end took over in frame "
-                f"{self.system.restarted[0]}; what is recorded is for one"
-            )
+            took_over = f"the camera was lost, and a new back end took over in frame {self.system.restarted[0]}"
+            logger.warning("%s: not written: %s; what is recorded is for one", path, took_over)
+            remove_file(path)  # of an earlier run
+            return
         truth, frames = sequence.ground_truth, tuple(self.tape)
         save_recording(Recording(sequence.name, sequence.rig, models, frames, truth, kind=sequence.kind), path)
 

@@ -15,8 +15,18 @@ from typing import NamedTuple
 from urllib.parse import quote
 
 from slam import registry
-from slam.errors import ConfigurationError, PartError, SequenceError, SlamError, UnknownNameError, cause
+from slam.errors import (
+    ConfigurationError,
+    PartError,
+    SequenceError,
+    SlamError,
+    UnknownNameError,
+    cause,
+)
 from slam.files import expanded, note_input, reason
+from slam.geometry.se3 import Array
+from slam.geometry.stamps import pair
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.naming import nearest, unknown
 from slam.query import read_query
 from slam.sequences import euroc, folders, kitti, ros
@@ -24,12 +34,14 @@ from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, l
 from slam.sequences.folders import VIDEO_SUFFIXES
 from slam.sequences.images import IMAGE_SUFFIXES
 from slam.sequences.options import RECORDED, Options
+from slam.sequences.tables import require_truth
 
 __all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
 
 _LOOKED_AT = 500  # entries below a folder that is no sequence, at each of so many levels
 _LEVELS = 4
 _LISTED = 6  # sequences below a folder
+_NEAR = 0.02  # [s] of a true pose's stamp to an image's, as `slam.evaluation.metrics.associate` has it
 
 
 class _Format(NamedTuple):
@@ -115,13 +127,26 @@ def _open_folder(text: str, format: str | None, quiet: bool) -> RecordedSequence
         found = (
             _FORMATS[name].open(folder, options, faults) if name in _FORMATS else _own(name, folder, options, faults)
         )
-        masks = read_masks(options.get("mask"), folder if folder.is_dir() else folder.parent, found.rig)
+        home = folder if folder.is_dir() else folder.parent
+        masks = read_masks(options.get("mask"), home, found.rig)
+        if "truth" in options:
+            given = _truth(home / expanded(options["truth"]), found.stamps)
+            found = replace(found, ground_truth=given, truth_noise=TruthNoise())
         swap = options.get("swap", False)
         options.require_read(f"{folder} is read as {name}")
     for line in () if quiet else lines:
         logger.warning("%s", line)
     truth = turned(found.ground_truth, found.rig)
     return replace(found, ground_truth=truth, masks=masks, swap=swap, warnings=lines)
+
+
+def _truth(path: Path, stamps: Array) -> Trajectory:
+    """The left camera's true path in TUM's form; SlamError where it is none, or of other times than the images."""
+    truth = require_truth(Trajectory.read_tum(path), path)
+    if (pair(truth.stamps, stamps, _NEAR) < 0).all():
+        ends = (f"{times[0]:.3f} to {times[-1]:.3f} s" for times in (truth.stamps, stamps))
+        raise SequenceError(f"{path}: no pose is within {_NEAR:g} s of an image: {', images are from '.join(ends)}")
+    return truth
 
 
 def _own(name: str, folder: Path, options: Options, faults: FaultLog) -> RecordedSequence:

@@ -11,7 +11,7 @@ from slam.query import number, read_query, word
 CALIBRATION = frozenset({"calibration", "unit", "rectified", "fisheye", "kind", "mask", "swap"})
 
 #: Options that every recorded format knows; which of them mean something depends on what is found in the folder.
-RECORDED = CALIBRATION | {"tolerance", "times", "fps", "left", "right", "layout"}
+RECORDED = CALIBRATION | {"tolerance", "times", "fps", "left", "right", "layout", "truth"}
 
 #: Frame rates that are believed [1/s].
 SLOWEST, FASTEST = 1e-3, 1e5

@@ -2,14 +2,20 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from slam.commands import compare as command
+from slam.commands.cli import app
 from slam.commands.compare import compare
 from slam.compare.plan import CLOSED_LOOP, Plan
-from slam.compare.tables import caution
+from slam.compare.sweep import Run
+from slam.compare.tables import caution, groups, sentences
 from slam.errors import ConfigurationError
+from slam.geometry.trajectory import Trajectory
 
 WORLDS = ("synthetic:aisle?frames=30", "synthetic:box")
 
@@ -71,3 +77,22 @@ def test_what_so_many_trials_can_show_is_said():
     assert caution(plan, 12).startswith("With 12 trials only a difference of 1.2 times its scatter")
     assert caution(plan, 2).startswith("2 trials can hardly show any difference")
     assert caution(replace(plan, backends=("ekf",)), 12) == ""
+
+
+@pytest.mark.parametrize("told", [{}, {"doubted": 1.0}])
+def test_without_a_true_path_the_distance_between_the_paths_is_told_and_doubt_is_a_status(told, tmp_path, monkeypatch):
+    plan, runs = Plan(("drive",), ("ekf", "smoother")), []
+    for trial, x in zip(plan.every, (0.0, 0.5)):
+        poses = np.tile(np.eye(4), (3, 1, 1))
+        poses[:, 0, 3] = x
+        paths = SimpleNamespace(final=Trajectory(np.arange(3.0), poses))
+        runs.append((Run(trial, "completed", {"path_m": 1.0} | told, {}, tmp_path / trial.folder), paths))
+    by_folder = {run.folder: paths for run, paths in runs}
+    monkeypatch.setattr("slam.compare.tables.RunData.read", lambda folder, name: by_folder[folder])
+    (group,) = groups(plan, [run for run, _ in runs])
+    said = sentences(group)
+    assert said[0].startswith("No true path is known")
+    assert said[1:] == ([] if told else ["Final paths of ekf and smoother are 500 mm apart (RMS)."])
+    monkeypatch.setattr("slam.commands.compare.compare", lambda *given: [run for run, _ in runs])
+    ended = CliRunner().invoke(app, ["compare", "drive", "--out", str(tmp_path / "out")])
+    assert ended.exit_code == len(told)

@@ -4,12 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from slam.commands.cli import app
 from slam.compare import trial
-from slam.compare.plan import Trial
+from slam.compare.plan import REPLAY, Plan, Trial
 from slam.compare.sweep import RUNS, is_done, read_run
 from slam.compare.trial import COMPLETED, keep_result
 from slam.errors import SlamError
+from slam.files import read_object
+from slam.sequences import open_sequence
+from slam.worlds.export import write_euroc
 
 
 @pytest.mark.parametrize("mode", ["closed loop", "replay"])
@@ -25,20 +30,23 @@ def test_a_run_knows_the_kind_of_motion_of_its_sequence(mode, tmp_path, monkeypa
         monkeypatch.setattr(trial, name, stopped)
     monkeypatch.setattr(trial, "load_recording", lambda path: path)
     drive = Trial("synthetic:street?frames=2", "ekf", mode=mode)
-    trial.run_trial(drive, tmp_path, None if mode == "closed loop" else tmp_path / "recording.npz")
+    (tape := tmp_path / "recording.npz").touch()
+    trial.run_trial(drive, tmp_path, None if mode == "closed loop" else tape)
     assert kinds == ["driving"]
 
 
 def test_what_was_run_with_other_settings_frames_or_versions_is_not_done(tmp_path, monkeypatch):
     """It lies there where a comparison that replaces another one was interrupted."""
     trial = Trial("synthetic:desk?frames=5", "ekf", settings=("frontend.features=100",))
+    plan = Plan((trial.sequence,), ("ekf",))
     keep_result(trial, tmp_path / RUNS / trial.folder, COMPLETED, {"ate_online_m": 0.1})
-    assert is_done(trial, tmp_path)
+    assert is_done(plan, trial, tmp_path)
     monkeypatch.setattr("slam.compare.sweep.versions", lambda: {"numpy": "0.1"})
-    assert not is_done(trial, tmp_path)
+    assert not is_done(plan, trial, tmp_path)
     monkeypatch.undo()
     other = replace(trial, settings=("frontend.features=900",))
-    assert not is_done(other, tmp_path) and not is_done(replace(trial, stop=3), tmp_path)
+    assert not is_done(replace(plan, replay=True), trial, tmp_path)  # there is no recording to replay
+    assert not is_done(plan, other, tmp_path) and not is_done(plan, replace(trial, stop=3), tmp_path)
 
 
 def test_a_figure_that_is_no_number_is_none_of_the_run(tmp_path):
@@ -46,3 +54,24 @@ def test_a_figure_that_is_no_number_is_none_of_the_run(tmp_path):
     trial = Trial("synthetic:desk?frames=5", "ekf")
     keep_result(trial, tmp_path / RUNS / trial.folder, COMPLETED, {"segment_percent": np.nan, "ate_online_m": 0.1})
     assert read_run(trial, tmp_path).metrics == {"completed": 1.0, "ate_online_m": 0.1}
+
+
+def test_a_run_that_began_again_has_figures_and_its_cause_and_no_recording(tmp_path):
+    """By a baseline 33 times too long nothing is tracked, and back end follows back end."""
+    drive = write_euroc(open_sequence("synthetic:desk?frames=9&baseline=0.075"), tmp_path / "drive")
+    camera = "fx: 260\nfy: 260\ncx: 160\ncy: 120\nbaseline: 2.5\n"
+    (tmp_path / "far.yaml").write_text(camera)
+    tape = tmp_path / "tape.npz"
+    tape.write_text("of an earlier run")
+    wrong = f"{drive}?calibration={tmp_path}/far.yaml"
+    ended = CliRunner().invoke(
+        app, ["run", wrong, "--out", str(tmp_path / "out"), "--record", str(tape), "--overwrite"]
+    )
+    assert ended.exit_code == 1 and not tape.exists()
+    assert "likely cause" in ended.stderr and ended.stderr.splitlines()[-1].startswith(f"slam: {tape}: not written")
+    given = Trial(wrong, "ekf")
+    trial.run_trial(given, tmp_path / "closed", tape)
+    trial.run_trial(replace(given, mode=REPLAY), tmp_path / "replay", tape)
+    closed, again = (read_object(tmp_path / name / "result.json") for name in ("closed", "replay"))
+    assert closed["outcome"] == COMPLETED and closed["metrics"]["tracked"] < 0.5
+    assert "began again" in again["outcome"]

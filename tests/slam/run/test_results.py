@@ -19,7 +19,7 @@ TEN, ONE, START, HUNDRED = "nees_10m_per_dof", "nees_1m_per_dof", "nees_per_dof"
     ("found", "runs", "words"),
     [
         ({}, 1, ""),
-        ({START: 1.0}, 1, "hold: from the start errors of the pose are 1 times what they claim (0.45 to 1.55 in 95 %"),
+        ({START: 1.0}, 1, "hold: from the start errors of the pose are as large as they claim (0.45 to 1.55 in 95 %"),
         ({START: 1.6}, 12, "are too small: from the start errors of the pose are 1.26 times what they claim (0.84"),
         ({START: 0.1}, 1, "are too large: from the start errors of the pose are 0.316 times"),
         ({TEN: 1.2, START: 0.9}, 1, "hold: over 10 m errors of the pose are 1.1 times"),
@@ -93,8 +93,9 @@ def test_figures_of_bodies_are_means_over_those_that_were_in_view():
 
 def test_runs_that_are_not_to_be_trusted_are_a_row_of_a_comparison_where_there_are_any(tmp_path):
     plan, trial = Plan(("synthetic:desk",), ("ekf",)), Trial("synthetic:desk", "ekf")
-    for doubt in ("", "rows do not agree"):
-        found = figures(summary(1.0) | {"doubt": doubt})
+    lost = {"status": {"started": 1, "lost": 39}}
+    for doubt in ({}, {"doubt": "rows do not agree"}, lost):
+        found = figures(summary(1.0) | doubt)
         (group,) = groups(plan, [Run(trial, "completed", found, {}, tmp_path)])
         assert ("runs not to be trusted [%]" in [metric.title for metric in group.metrics]) == bool(doubt)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import slam
-from slam.errors import CalibrationError, ConfigurationError, SequenceError
+from slam.errors import CalibrationError, ConfigurationError, SequenceError, SlamError
 from slam.input.features import outside_masks
 from slam.sequences import open_sequence, with_mask
 from slam.worlds import open_world
@@ -296,3 +296,16 @@ def test_a_video_that_ends_too_early(videos: Path, build: SimpleNamespace) -> No
     frames = list(sequence)
     assert 0 < len(frames) < len(sequence)
     assert f"left.avi: ends or is damaged at frame {len(frames)} of 12" in sequence.warnings[-1]
+
+
+def test_a_true_path_is_given_by_an_option(two_folders: Path) -> None:
+    stamps = open_sequence(two_folders).stamps
+    truth = slam.Trajectory(stamps, np.tile(np.eye(4), (len(stamps), 1, 1)))
+    truth.poses[:, 0, 3] = 3.0 * stamps + 1.0
+    truth.write_tum(two_folders / "true.txt")
+    found = open_sequence(f"{two_folders}?truth=true.txt").ground_truth
+    np.testing.assert_allclose(found.poses, truth.poses, atol=1e-8)
+    slam.Trajectory(stamps + 1e6, truth.poses).write_tum(two_folders / "late.txt")
+    for name, line in (("late.txt", "no pose is within"), ("none.txt", "none.txt")):
+        with pytest.raises(SlamError, match=line):
+            open_sequence(f"{two_folders}?truth={name}")
