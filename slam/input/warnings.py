@@ -53,6 +53,7 @@ class InputWarnings:
         self._pair_warned = self._pair_is_right = False
         self._texture_warned = self._partners_explained = False
         self._two_images = self._copy_warned = False  # a pair of different images was seen, a copy was named
+        self._before: StereoFrame | None = None  # the frame before, until a pair was right
         self._last: Checksum | None = None  # of the frame before
         self._last_copy = ""  # why its right image was a copy
         self._grain_warned = False
@@ -74,6 +75,7 @@ class InputWarnings:
             self._warn(grain)
         if looked_at and not self._pair_warned:
             self._check_pair(frame, features)
+        self._before = None if self._pair_is_right or self._pair_warned else frame
         if len(self._stamps) <= _INTERVALS:
             self._stamps.append(features.stamp)
             if len(self._stamps) > _INTERVALS:
@@ -161,7 +163,10 @@ class InputWarnings:
         elif 4 * stereo < len(features) and not most(own.as_given, own.matches - own.as_given):
             said = self._mirrored(left, right, own)
         if not said and (own.rows_differ or (own.shown < 1 and not self._pair_is_right)):
-            said = self._transposed(left, right, own) or _rows_differ(own, self._rig)
+            if self._before is None and not self._pair_is_right:
+                return  # until there is a frame before, of whose moment one of the images may be
+            said = self._of_two_moments(left, right, own) or self._transposed(left, right, own)
+            said = said or _rows_differ(own, self._rig)
         self._pair_is_right |= own.conclusive
         if said:
             self._pair_warned = self._partners_explained = True  # the reason is known then
@@ -177,6 +182,23 @@ class InputWarnings:
             f"{own.matches} in it as it is; give both images as their cameras see"
         )
 
+    def _of_two_moments(self, left: Points, right: Points, own: PairGeometry) -> str:
+        """That rows agree with those of the other camera in the frame before, where they do."""
+        if (before := self._before) is None:
+            return ""
+        for word, one, two in (
+            ("late", _points(before.left, self._rig), right),
+            ("early", left, _points(before.right, self._rig)),
+        ):
+            found = pair_geometry(self._rig, one, two, self._rows) if one and two else PairGeometry(0)
+            if found.conclusive and not found.rows_differ and most(own.off_rows, found.off_rows):
+                return (
+                    f"left and right image are not of one moment: rows of {own.off_rows} of {own.matches} features "
+                    f"differ, and {found.off_rows} of {found.matches} where right images are taken to come a "
+                    f"frame {word}; pair them by their times or numbers, and let one camera trigger the other"
+                )
+        return ""
+
     def _transposed(self, left: Points, right: Points, own: PairGeometry) -> str:
         """That rows agree with the inverse of the calibration's rotation, where they do."""
         rig = self._rig
@@ -184,11 +206,11 @@ class InputWarnings:
             return ""
         with suppress(CalibrationError):
             inverse = pair_geometry(replace(rig, R=rig.R.T), left, right, self._rows)
-            if not inverse.rows_differ and most(inverse.as_given, own.as_given):
+            if not inverse.rows_differ and most(own.off_rows, inverse.off_rows):
                 return (
-                    f"rows of left and right image agree with the inverse of the calibration's rotation, "
-                    f"{inverse.as_given} features, and {own.as_given} as it is: is R transposed, or from the right "
-                    "camera to the left one?"
+                    f"rows of left and right image agree with the inverse of the calibration's rotation but for "
+                    f"{inverse.off_rows} features, and but for {own.off_rows} as it is: are the images of one moment, "
+                    "and if so, is R transposed, or from the right camera to the left one?"
                 )
         return ""
 
@@ -263,6 +285,11 @@ def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
         cause = (
             "were they rectified, as this calibration says (no distortion or rotation), and are they of one moment, or "
             "must numbers be shifted by one?"
+        )
+    elif found.shown < -0.5:  # guard: between -1, as the opposite does, and 0
+        return (
+            "rows of left and right image show the opposite of what the calibration's rectification does to rows: is "
+            "the sign of the distortion exchanged?"
         )
     elif found.shown < 1:
         before = "the images were rectified before, or undistorted, and are again; give the calibration after that"

@@ -63,7 +63,7 @@ def load_rig(
             and baseline in YAML. Two files: OpenCV's intrinsics and extrinsics, ROS's or EuRoC's of the left and the
             right camera. Or the folder where they are under their usual names.
         size: width and height of the images [px], where the file names none.
-        unit: of length in an OpenCV file: ``"m"``, ``"cm"`` or ``"mm"``.
+        unit: of length in an OpenCV file: ``"m"``, ``"cm"``, ``"mm"`` or ``"in"``, inches.
         rectified: take the rectified cameras (``P1``, ``P2``).
         fisheye: the distortion in an OpenCV file is ``cv2.fisheye``'s.
 
