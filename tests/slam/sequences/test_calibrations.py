@@ -171,11 +171,12 @@ def test_the_same_rig_in_the_words_of_many_programs_and_people(tmp_path: Path, n
 
 
 @pytest.mark.parametrize(("length", "units"), [(120.0, "cm mm"), (12.0, "cm in"), (4.73, "cm in"), (0.1, "")])
-def test_a_unit_that_is_proposed_gives_the_baseline_that_is_said(tmp_path: Path, build: SimpleNamespace, length, units):
+def test_a_unit_that_is_proposed_gives_the_baseline_that_is_said(tmp_path: Path, build, caplog, length, units):
     entries = build.stereo_entries(length)
     build.write_storage(tmp_path / "calibration.yaml", entries)
     proposed = re.findall(r"unit=(\w+) makes it (\S+) m", in_units(slam.load_rig(tmp_path, size=SIZE).baseline))
     assert [unit for unit, _ in proposed] == units.split()
+    assert ("m apart by their calibration: is it in metres?" in caplog.text) == (length > 10)
     for unit, metres in proposed:
         assert slam.load_rig(tmp_path, size=SIZE, unit=unit).baseline == pytest.approx(float(metres), rel=0.01)
 
