@@ -97,23 +97,15 @@ class Covariance:
 
     # --- the camera moves ---
 
-    def advanced(self, by_error: Array, J: Array, noise: Array) -> Covariance:
-        """After a motion of the camera, see `camera_moved`.
+    def camera_moved(self, J: Array, noise: Array, by_error: Array | None = None) -> Covariance:
+        """The camera's error (12,) becomes J times what it was, plus noise (12, 12).
 
-        Its pose before, `by_error` (6, 6) times [r, φ], is the first of the last ones now; the last of them goes.
+        With `by_error`, the pose before, that (6, 6) times [r, φ], is now the first of the last ones; the last goes.
         """
-        F = np.eye(HEAD, k=-POSE)
-        F[:CAMERA, :CAMERA], F[CAMERA : CAMERA + POSE, :CAMERA] = J, np.pad(by_error, ((0, 0), (0, POSE)))
-        return self._moved(F, noise)
-
-    def camera_moved(self, J: Array, noise: Array) -> Covariance:
-        """The camera's error (12,) becomes J times what it was, plus noise (12, 12)."""
-        F = np.eye(HEAD)
+        F = np.eye(HEAD) if by_error is None else np.eye(HEAD, k=-POSE)
         F[:CAMERA, :CAMERA] = J
-        return self._moved(F, noise)
-
-    def _moved(self, F: Array, noise: Array) -> Covariance:
-        """The errors (36,) of camera and last poses become F times what they were; the camera's has more noise."""
+        if by_error is not None:
+            F[CAMERA : CAMERA + POSE, :CAMERA] = np.pad(by_error, ((0, 0), (0, POSE)))
         P, by_rig = self.P.copy(), self.by_rig.copy()
         P[:HEAD], by_rig[:HEAD] = F @ P[:HEAD], F @ by_rig[:HEAD]
         own = P[:HEAD, :HEAD] @ F.T

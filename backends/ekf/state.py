@@ -53,7 +53,7 @@ class FilterState:
     def advanced(self, stamp: float, motion: Motion) -> FilterState:
         """At a later time, after a motion of the camera."""
         camera, J, noise = motion
-        covariance = self.covariance.advanced(self.camera.by_error(), J, noise)
+        covariance = self.covariance.camera_moved(J, noise, self.camera.by_error())
         return replace(
             self, stamp=stamp, frame=self.frame + 1, closed=False, camera=camera, covariance=covariance
         )  # fmt: skip

@@ -16,7 +16,8 @@ from slam.tracks.table import Tracks
 
 _TOO_FAR = 3.0  # expected points so far off that linearising there is worse than at the measured point [px]
 _STEPS = 4  # numerics: of Gauss-Newton at most
-AGREES = 12.0  #: derived: χ²(3) at 99.3 %, of places or velocities that are the same; a velocity counts from it on
+MOVES = 12.0  #: derived: χ²(3) at 99.3 % of the velocity, from which it counts
+AGREES = 11.3  #: derived: χ²(3) at 99 %, of places or velocities that are the same
 
 
 def measure(rig: StereoRig, T_world_left: Array, points: Array, measured: Array, sigma: float) -> tuple:
@@ -70,7 +71,7 @@ def constant_velocity(tracks: Tracks, rows: IndexArray, times: Array, max_speed:
 def fit_velocities(tracks: Tracks, rows: IndexArray, times: Array, max_speed: float) -> None:
     """Give tracks a velocity, in place, where a fixed point does not explain them; see `constant_velocity`."""
     m = constant_velocity(tracks, rows, times, max_speed)
-    moves = m.test > AGREES
+    moves = m.test > MOVES
     moving = rows[moves]
     tracks.velocity[moving], tracks.velocity_covariance[moving] = m.velocity[moves], m.velocity_covariance[moves]
     tracks.position[moving], tracks.covariance[moving] = m.position[moves], m.covariance[moves]

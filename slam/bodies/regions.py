@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.bodies.config import MIN_FRAMES, RUN
-from slam.bodies.fits import AGREES, ConstantVelocity, constant_velocity
+from slam.bodies.fits import AGREES, MOVES, ConstantVelocity, constant_velocity
 from slam.bodies.frame import Frame
 from slam.data import BoolArray, IndexArray
 from slam.geometry.kernels import squared_distances
@@ -22,6 +22,7 @@ from slam.geometry.rig import MINIMAL_POINTS
 from slam.geometry.se3 import Array
 from slam.tracks.table import Tracks
 
+_NEAR = 7.8  # derived: χ²(3) at 95 %, of tracks inside the region
 _OVERLAP = 3.0  # velocities of successive frames come from the same window: their covariance is larger by so much
 
 
@@ -85,13 +86,13 @@ def follow_regions(regions: list[Region], frame: Frame, tracks: Tracks) -> tuple
     k = np.flatnonzero((depth > 0) & (s.depth_noise(depth) < s.radius(depth)))
     m, rows, radius = ConstantVelocity(*(column[k] for column in vars(m).values())), rows[k], s.radius(depth[k])
     spread = np.eye(3) * (radius**2 / 3.0)[:, None, None]  # as of a ball's points
-    moves = (m.test > AGREES) & (np.linalg.norm(m.velocity, axis=1) > c.min_speed)
+    moves = (m.test > MOVES) & (np.linalg.norm(m.velocity, axis=1) > c.min_speed)
 
     def off(r: Region, places: Array | float = 0.0) -> tuple[Array, BoolArray]:
         """χ²(3) of the tracks' velocities against the region's, and which lie in it."""
         left = squared_distances(m.velocity - r.state[3:], m.velocity_covariance + r.covariance[3:, 3:])
         away = squared_distances(m.position - r.state[:3], spread + places + r.covariance[:3, :3])
-        return left, np.asarray(away < AGREES)
+        return left, np.asarray(away < _NEAR)
 
     followed, free = [], moves.copy()
     for region in sorted(regions, key=lambda region: -region.frames):
@@ -119,7 +120,7 @@ def _new_regions(
     """Regions of free tracks (K,) that lie together and move alike, the largest first: two at least."""
     place, P, V = m.position[free], m.covariance[free], m.velocity_covariance[free]
     alike = [
-        (squared_distances(place - place[i], spread[free] + P + P[i] + spread[free[i]]) < AGREES)
+        (squared_distances(place - place[i], spread[free] + P + P[i] + spread[free[i]]) < _NEAR)
         & (squared_distances(m.velocity[free] - m.velocity[free[i]], V + V[i]) < AGREES)
         for i in range(len(free))
     ]

@@ -143,9 +143,7 @@ def _own(name: str, folder: Path, options: Options, faults: FaultLog) -> Recorde
 def _open_world(text: str) -> Sequence:
     from slam.worlds import open_world
 
-    opened = open_world(text)
-    opened.masks = read_masks(opened.values["mask"] or None, Path.cwd(), opened.rig)
-    return opened
+    return open_world(text, lambda names, rig: read_masks(names, Path.cwd(), rig))
 
 
 def with_mask(text: str, mask: str | None) -> str:

@@ -9,6 +9,7 @@ May import `slam.geometry` and the data.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from slam import registry
+from slam.data import BoolArray
 from slam.errors import ConfigurationError, UnknownNameError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import so3_exp
@@ -37,10 +39,15 @@ def names() -> list[str]:
     return list(SCENES)
 
 
-def open_world(text: str) -> WorldSequence:
+#: Reads the masks of both cameras, (H, W) bool, from the option ``mask`` for a rig.
+ReadMasks = Callable[[str, StereoRig], tuple[BoolArray | None, BoolArray | None]]
+
+
+def open_world(text: str, read_masks: ReadMasks | None = None) -> WorldSequence:
     """The recording that a text such as ``"aisle?frames=200&seed=3"`` describes.
 
-    A world of one's own is ``"my_module:SCENE?frames=200"``, a `slam.worlds.scenes.Scene`.
+    A world of one's own is ``"my_module:SCENE?frames=200"``, a `slam.worlds.scenes.Scene`. The option ``mask`` needs
+    what reads it, as `slam.open_sequence` gives it.
 
     Raises:
         UnknownNameError: there is no such world.
@@ -49,6 +56,8 @@ def open_world(text: str) -> WorldSequence:
     text = text.removeprefix("synthetic:")
     name, _, query = text.partition("?")
     values = parse_query(name, query, options(name))
+    if values["mask"] and read_masks is None:
+        raise ConfigurationError(f"{name}: 'mask' is an option for slam.open_sequence alone")
     key = tuple(sorted((k, v) for k, v in values.items() if k not in _RECORDING_ONLY))
     world = _build(name, key)
     told, recorded = world.rig, world
@@ -57,7 +66,10 @@ def open_world(text: str) -> WorldSequence:
         left, right = (replace(c, fu=share * c.fu, fv=share * c.fv) for c in (told.left, told.right))
         true = StereoRig(left, right, so3_exp(np.full(3, turn)) @ told.R, told.b)
         recorded = replace(world, rig=true)
-    return WorldSequence(text, recorded, values, told)
+    sequence = WorldSequence(text, recorded, values, told)
+    if values["mask"] and read_masks is not None:
+        sequence.masks = read_masks(values["mask"], told)
+    return sequence
 
 
 def options(name: str) -> dict[str, Option]:

@@ -152,7 +152,7 @@ def advanced(covariance: Covariance, P: np.ndarray, rng) -> tuple[Covariance, np
         F = np.eye(len(P))
         F[:HEAD, :HEAD] = np.eye(HEAD, k=-6)
         F[:12, :12], F[12:18, :6], F[12:18, 6:12] = J, pose, 0.0
-        covariance, P = covariance.advanced(pose, J, noise), F @ P @ F.T
+        covariance, P = covariance.camera_moved(J, noise, pose), F @ P @ F.T
         P[:12, :12] += noise
     return covariance, P
 
@@ -306,7 +306,7 @@ def corrected(s: FilterState, update: Update) -> np.ndarray:
 
 
 def residuals(s: FilterState, update: Update, change: np.ndarray) -> np.ndarray:
-    """Solution: of the prior, whose covariance is diagonal, and of the measurements."""
+    """Whitened: of the prior, whose covariance is diagonal, and of the measurements."""
     z = update.linearised(s.camera.moved(change[:12]), change[12:]).z
     prior = change / np.sqrt(np.diag(dense(s.covariance)))
     return np.concatenate([prior, ((update.z - z) / update.sigma).reshape(-1)])

@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 import backends
 from backends.ekf import EkfBackend
+from backends.ekf.innovation import Linearisation, Solution
 from backends.ekf.motion import EulerCamera
 from backends.iekf import IekfBackend
 from slam.data import Observations, UpdateStatus
@@ -164,6 +165,21 @@ def test_a_step_that_runs_away_is_a_status_with_a_reason(drive, monkeypatch):
     monkeypatch.setattr(EulerCamera, "transport", lambda *_: np.zeros((12, 12)))
     report = backend.update(seen)
     assert report.status is UpdateStatus.FAILED and report.reason.startswith("ekf: ")
+
+
+@pytest.mark.parametrize("turn", [4.0, np.nan])
+def test_a_step_of_more_than_half_a_turn_is_a_status_with_a_reason(drive, monkeypatch, turn):
+    backend, seen = predicted(drive, 5)
+    solved = Linearisation.solved
+
+    def turned(self: Linearisation, used: np.ndarray) -> Solution:
+        found = solved(self, used)
+        found.change[3] += turn
+        return found
+
+    monkeypatch.setattr(Linearisation, "solved", turned)
+    report = backend.update(seen)
+    assert report.status is UpdateStatus.FAILED and "half a turn" in report.reason
 
 
 @BOTH

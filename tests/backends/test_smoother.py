@@ -187,18 +187,25 @@ def test_landmarks_behind_the_camera_are_as_uncertain_as_the_poses_that_saw_them
     assert passed.sum() > 20 and np.median(squared[passed]) < 6  # χ²₃: 2.4; they share the path's error
 
 
+def swaying(frames: int, points: int):
+    """A camera that sways before a few points."""
+    sway = np.cos(np.arange(frames) / 12)
+    return scene(
+        se3.pose(np.tile(np.eye(3), (frames, 1, 1)), (sway - 1)[:, None] * np.array([0.4, 0, 0.2])),
+        points=points, limit=points,
+    )  # fmt: skip
+
+
 def test_a_landmark_measured_for_longer_than_the_lag_keeps_what_was_known_of_it():
     """A camera sways before the same few points: its error does not grow with every lag."""
-    sway = np.cos(np.arange(150) / 12)
-    poses = se3.pose(np.tile(np.eye(3), (150, 1, 1)), (sway - 1)[:, None] * np.array([0.4, 0.0, 0.2]))
     # A variable is made only where a landmark's distance is at least 30 of its deviations: with 3 px few would be.
-    data, models = scene(poses, points=8, limit=8), replace(MODELS, pixel_sigma=1.0)
+    data, models = swaying(150, 8), replace(MODELS, pixel_sigma=1.0)
     kept, anew = (SmootherBackend(RIG, models, landmarks=n) for n in (20, 0))
     for backend in (kept, anew):
         run(backend, data)
     deviations = [np.sqrt(np.trace(b.estimate(landmarks=False).covariance[3:, 3:])) for b in (kept, anew)]
     assert deviations[0] < 0.5 * deviations[1], deviations
-    assert errors(kept.trajectory().poses[-1], poses[-1])[0] < 3 * deviations[0]
+    assert errors(kept.trajectory().poses[-1], data.poses[-1])[0] < 3 * deviations[0]
     estimate = kept.estimate()
     off = estimate.positions - data.points[estimate.ids]
     distances = np.einsum("ni,nij,nj->n", off, np.linalg.inv(estimate.covariances), off)
@@ -207,9 +214,7 @@ def test_a_landmark_measured_for_longer_than_the_lag_keeps_what_was_known_of_it(
 
 def test_landmarks_that_are_variables_outlast_more_than_a_lag_of_frames_that_measured_nothing():
     """They had left the graph before they were measured again, and there was nothing but the motion model."""
-    sway = np.cos(np.arange(60) / 12)
-    poses = se3.pose(np.tile(np.eye(3), (60, 1, 1)), (sway - 1)[:, None] * np.array([0.4, 0.0, 0.2]))
-    data, backend, known = scene(poses, points=8, limit=8), SmootherBackend(RIG, MODELS, lag=6), set()
+    data, backend, known = swaying(60, 8), SmootherBackend(RIG, MODELS, lag=6), set()
     for k, (stamp, _, seen) in enumerate(data):
         if 40 <= k < 50:
             enter(backend, k, stamp, seen)
@@ -222,7 +227,7 @@ def test_landmarks_that_are_variables_outlast_more_than_a_lag_of_frames_that_mea
     assert (backend.state.landmarks.factor[: len(variables)] == VARIABLE)[variables].all()
     deviations = [np.sqrt(np.trace(e.covariance[3:, 3:])) for e in (before, after)]
     assert deviations[1] < 1.5 * deviations[0], deviations
-    assert errors(after.T_world_left, poses[-1])[0] < 3 * deviations[1]
+    assert errors(after.T_world_left, data.poses[-1])[0] < 3 * deviations[1]
 
 
 # --- measurements that are mended ---
@@ -325,15 +330,6 @@ def test_a_known_landmark_tells_what_is_known_of_it():
 
 
 # --- what goes on from one graph to the next ---
-
-
-def swaying(frames: int, points: int):
-    """A camera that sways before a few points."""
-    sway = np.cos(np.arange(frames) / 12)
-    return scene(
-        se3.pose(np.tile(np.eye(3), (frames, 1, 1)), (sway - 1)[:, None] * np.array([0.4, 0, 0.2])),
-        points=points, limit=points,
-    )  # fmt: skip
 
 
 def test_a_predicted_pose_has_the_covariance_of_the_velocity_that_it_moves_on_with():

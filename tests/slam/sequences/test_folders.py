@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 import slam
-from slam.errors import CalibrationError, SequenceError
+from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.input.features import outside_masks
 from slam.sequences import open_sequence, with_mask
+from slam.worlds import open_world
 from tests import recordings
 from tests.recordings import FIVE, rename, seeds
 
@@ -235,6 +236,8 @@ def test_features_under_a_mask_are_not_used(tmp_path: Path, two_folders: Path) -
         with_mask("synthetic:desk?frames=3", f"{tmp_path / 'left half.png'},{tmp_path / 'all.png'}")
     )
     frame = sequence[2]
+    with pytest.raises(ConfigurationError, match="mask"):
+        open_world("desk?frames=3&mask=none.png")
     assert frame.right_mask.all() and not frame.left_mask[:, :160].any() and frame.left_mask[:, 160:].all()
     rows = np.column_stack([np.linspace(10, 310, 7), np.full(7, 120.0)])
     ones = np.ones(7)
