@@ -14,6 +14,7 @@ from slam.geometry.camera import baseline_doubt, oblong, size_doubt
 from slam.geometry.rig import StereoRig
 from slam.grey_range import eight_bits, grey_range
 from slam.input.grain import grain_doubt
+from slam.input.moment import ONE_MOMENT
 from slam.input.pair import NO_DISPARITY, PairGeometry, Points, most, pair_geometry, points_of
 from slam.models import EstimatorModels
 from slam.tracks.step import ENOUGH_FEATURES
@@ -165,8 +166,7 @@ class InputWarnings:
         if not said and (own.rows_differ or (own.shown < 1 and not self._pair_is_right)):
             if self._before is None and not self._pair_is_right:
                 return  # until there is a frame before, of whose moment one of the images may be
-            said = self._of_two_moments(left, right, own) or self._transposed(left, right, own)
-            said = said or _rows_differ(own, self._rig)
+            said = self._explained(left, right, own) or _rows_differ(own, self._rig)
         self._pair_is_right |= own.conclusive
         if said:
             self._pair_warned = self._partners_explained = True  # the reason is known then
@@ -182,37 +182,27 @@ class InputWarnings:
             f"{own.matches} in it as it is; give both images as their cameras see"
         )
 
-    def _of_two_moments(self, left: Points, right: Points, own: PairGeometry) -> str:
-        """That rows agree with those of the other camera in the frame before, where they do."""
-        if (before := self._before) is None:
+    def _explained(self, left: Points, right: Points, own: PairGeometry) -> str:
+        """What makes rows agree best, where something does: another moment of one image, or the rotation's inverse."""
+        rig, before, tried = self._rig, self._before, []
+        if before is not None:
+            tried.append((_points(before.left, rig), right, rig, "where right images are taken to come a frame late"))
+            tried.append((left, _points(before.right, rig), rig, "where right images are taken to come a frame early"))
+        if not rig.is_rectified:
+            tried.append((left, right, replace(rig, R=rig.R.T), "with the inverse of the calibration's rotation"))
+        best, said = 1.0, ""
+        for one, two, other, how in tried:
+            with suppress(CalibrationError):
+                found = pair_geometry(other, one, two, self._rows) if one and two else PairGeometry(0)
+                share = found.off_rows / max(found.matches, 1)
+                if found.conclusive and not found.rows_differ and share < best and most(own.off_rows, found.off_rows):
+                    best, said = share, f"{found.off_rows} of {found.matches} {how}"
+        if not said:
             return ""
-        for word, one, two in (
-            ("late", _points(before.left, self._rig), right),
-            ("early", left, _points(before.right, self._rig)),
-        ):
-            found = pair_geometry(self._rig, one, two, self._rows) if one and two else PairGeometry(0)
-            if found.conclusive and not found.rows_differ and most(own.off_rows, found.off_rows):
-                return (
-                    f"left and right image are not of one moment: rows of {own.off_rows} of {own.matches} features "
-                    f"differ, and {found.off_rows} of {found.matches} where right images are taken to come a "
-                    f"frame {word}; pair them by their times or numbers, and let one camera trigger the other"
-                )
-        return ""
-
-    def _transposed(self, left: Points, right: Points, own: PairGeometry) -> str:
-        """That rows agree with the inverse of the calibration's rotation, where they do."""
-        rig = self._rig
-        if rig.is_rectified:
-            return ""
-        with suppress(CalibrationError):
-            inverse = pair_geometry(replace(rig, R=rig.R.T), left, right, self._rows)
-            if not inverse.rows_differ and most(own.off_rows, inverse.off_rows):
-                return (
-                    f"rows of left and right image agree with the inverse of the calibration's rotation but for "
-                    f"{inverse.off_rows} features, and but for {own.off_rows} as it is: are the images of one moment, "
-                    "and if so, is R transposed, or from the right camera to the left one?"
-                )
-        return ""
+        cause = f"left and right image are not of one moment: {ONE_MOMENT}"
+        if "inverse" in said:
+            cause = "is R transposed, or from the right camera to the left one, or are the images not of one moment?"
+        return f"rows of {own.off_rows} of {own.matches} features differ, and {said}; {cause}"
 
     def copied(self, frame: StereoFrame, checksum: Checksum | None) -> tuple[Checksum | None, str]:
         """Why the right image is a copy, which measures nothing (empty if it is none), and the frame's checksum.
