@@ -184,7 +184,8 @@ class InputWarnings:
 
     def _explained(self, left: Points, right: Points, own: PairGeometry) -> str:
         """What makes rows agree best, where something does: another moment of one image, or the rotation's inverse."""
-        rig, before, tried = self._rig, self._before, []
+        rig, before = self._rig, self._before
+        tried: list[tuple[Points | None, Points | None, StereoRig, str]] = []
         if before is not None:
             tried.append((_points(before.left, rig), right, rig, "where right images are taken to come a frame late"))
             tried.append((left, _points(before.right, rig), rig, "where right images are taken to come a frame early"))
@@ -197,12 +198,10 @@ class InputWarnings:
                 share = found.off_rows / max(found.matches, 1)
                 if found.conclusive and not found.rows_differ and share < best and most(own.off_rows, found.off_rows):
                     best, said = share, f"{found.off_rows} of {found.matches} {how}"
-        if not said:
-            return ""
         cause = f"left and right image are not of one moment: {ONE_MOMENT}"
         if "inverse" in said:
             cause = "is R transposed, or from the right camera to the left one, or are the images not of one moment?"
-        return f"rows of {own.off_rows} of {own.matches} features differ, and {said}; {cause}"
+        return said and f"rows of {own.off_rows} of {own.matches} features differ, and {said}; {cause}"
 
     def copied(self, frame: StereoFrame, checksum: Checksum | None) -> tuple[Checksum | None, str]:
         """Why the right image is a copy, which measures nothing (empty if it is none), and the frame's checksum.
@@ -276,19 +275,16 @@ def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
             "were they rectified, as this calibration says (no distortion or rotation), and are they of one moment, or "
             "must numbers be shifted by one?"
         )
-    elif found.shown < -0.5:  # guard: between -1, as the opposite does, and 0
-        return (
-            "rows of left and right image show the opposite of what the calibration's rectification does to rows: is "
-            "the sign of the distortion exchanged?"
-        )
     elif found.shown < 1:
         before = "the images were rectified before, or undistorted, and are again; give the calibration after that"
         if left.has_distortion or right.has_distortion:
             cause = f"{before}, or leave the distortion out"
         else:
             cause = f"the lenses' distortion is missing in it; or {before}"
+        if found.shown < -0.5:  # guard: between images without it, 0, and with the opposite, -1
+            cause = "is the sign of the distortion exchanged?"
         return (
-            f"rows of left and right image show {100 * max(found.shown, 0.0):.0f} % of what the calibration's "
+            f"rows of left and right image show {100 * found.shown:.0f} % of what the calibration's "
             f"rectification does to rows: {cause}"
         )
     else:
