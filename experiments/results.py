@@ -122,7 +122,8 @@ EXPERIMENTS = (
         "consistency", "honesty", "Do the back ends know how sure they are?", arguments=("--seeds", "30"), pictures={
             "consistency": "Above: error of the newest position and the bound. Below: NEES of its pose and the band."
         }, left_out=("with 10 % wrong", "rejected"), says="Errors over the Cramér-Rao bound; whether covariances hold; "
-        "errors, and their ratio where a tenth of the matches is wrong.",
+        "errors, and their ratio where a tenth of the matches is wrong. The bound of `drawn` is a mean over paths that "
+        "differ, which an estimator with the right prior may go below.",
     ),
     Experiment(
         "corridor", "honesty", "The camera along a corridor without end", arguments=("--seeds", "8"), pictures={

@@ -194,15 +194,22 @@ _SHORTEST, _LONGEST = 0.005, 10.0
 
 _USUAL = (0.02, 2.0)  # guard: baselines [m] that a unit is proposed for
 
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}  # of a calibration's lengths, by the option unit [m]
+
 
 def baseline_doubt(baseline: float) -> str:
     """What is wrong with an implausible baseline; empty if it is plausible."""
     if _SHORTEST <= baseline <= _LONGEST:
         return ""
-    metres = {unit: baseline * size for unit, size in (("cm", 0.01), ("mm", 0.001))}
-    likely = [f"in {unit} it is {b:.3g} m" for unit, b in metres.items() if _USUAL[0] <= b <= _USUAL[1]]
-    hint = f" ({', '.join(likely)}: a recording's option unit=mm; in Python divide T)" if likely else ""
-    return f"the cameras are {baseline:g} m apart by their calibration: is it in metres?{hint}"
+    return f"the cameras are {baseline:g} m apart by their calibration: is it in metres?{in_units(baseline)}"
+
+
+def in_units(baseline: float) -> str:
+    """What each unit makes of a baseline that was read as metres, and how to give it; empty where none is usual."""
+    metres = {unit: baseline * size for unit, size in UNITS.items() if unit != "m"}
+    likely = [f"unit={unit} makes it {m:.3g} m" for unit, m in metres.items() if _USUAL[0] <= m <= _USUAL[1]]
+    which = "" if len(likely) == 1 else "; measure which is right"
+    return f" (of numbers read as metres, {', '.join(likely)}{which}; in Python scale T)" if likely else ""
 
 
 #: guard: Largest distance of a principal point from the middle of an image, as a share of half its width or height, and

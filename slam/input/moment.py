@@ -13,6 +13,10 @@ _LEAST, _MOST = 15, 64  # guard: blocks of frames of which a lag is taken; cost:
 _FLOW = 4.0  # guard: flow [px] beyond which rows would differ by more than they are matched with
 
 
+#: What to do about images of two moments.
+ONE_MOMENT = "pair them by their times or numbers, and let one camera trigger the other"
+
+
 class MomentWatch:
     """The lag of the right images, in frames, from the features and poses of successive frames.
 
@@ -64,8 +68,7 @@ class MomentWatch:
         word = max(found, key=lambda word: found[word])
         return word and (
             "left and right image are not of one moment: rows of their features differ with the motion, as if right "
-            f"images were {word} by a part of a frame or more; pair them by their times or numbers, and let one camera "
-            "trigger the other"
+            f"images were {word} by a part of a frame or more; {ONE_MOMENT}"
         )
 
     def _points(self, features: StereoFeatures) -> Array:

@@ -14,6 +14,7 @@ from slam.geometry.camera import baseline_doubt, oblong, size_doubt
 from slam.geometry.rig import StereoRig
 from slam.grey_range import eight_bits, grey_range
 from slam.input.grain import grain_doubt
+from slam.input.moment import ONE_MOMENT
 from slam.input.pair import NO_DISPARITY, PairGeometry, Points, most, pair_geometry, points_of
 from slam.models import EstimatorModels
 from slam.tracks.step import ENOUGH_FEATURES
@@ -53,6 +54,7 @@ class InputWarnings:
         self._pair_warned = self._pair_is_right = False
         self._texture_warned = self._partners_explained = False
         self._two_images = self._copy_warned = False  # a pair of different images was seen, a copy was named
+        self._before: StereoFrame | None = None  # the frame before, until a pair was right
         self._last: Checksum | None = None  # of the frame before
         self._last_copy = ""  # why its right image was a copy
         self._grain_warned = False
@@ -74,6 +76,7 @@ class InputWarnings:
             self._warn(grain)
         if looked_at and not self._pair_warned:
             self._check_pair(frame, features)
+        self._before = None if self._pair_is_right or self._pair_warned else frame
         if len(self._stamps) <= _INTERVALS:
             self._stamps.append(features.stamp)
             if len(self._stamps) > _INTERVALS:
@@ -161,7 +164,9 @@ class InputWarnings:
         elif 4 * stereo < len(features) and not most(own.as_given, own.matches - own.as_given):
             said = self._mirrored(left, right, own)
         if not said and (own.rows_differ or (own.shown < 1 and not self._pair_is_right)):
-            said = self._transposed(left, right, own) or _rows_differ(own, self._rig)
+            if self._before is None and not self._pair_is_right:
+                return  # until there is a frame before, of whose moment one of the images may be
+            said = self._explained(left, right, own) or _rows_differ(own, self._rig)
         self._pair_is_right |= own.conclusive
         if said:
             self._pair_warned = self._partners_explained = True  # the reason is known then
@@ -177,20 +182,26 @@ class InputWarnings:
             f"{own.matches} in it as it is; give both images as their cameras see"
         )
 
-    def _transposed(self, left: Points, right: Points, own: PairGeometry) -> str:
-        """That rows agree with the inverse of the calibration's rotation, where they do."""
-        rig = self._rig
-        if rig.is_rectified:
-            return ""
-        with suppress(CalibrationError):
-            inverse = pair_geometry(replace(rig, R=rig.R.T), left, right, self._rows)
-            if not inverse.rows_differ and most(inverse.as_given, own.as_given):
-                return (
-                    f"rows of left and right image agree with the inverse of the calibration's rotation, "
-                    f"{inverse.as_given} features, and {own.as_given} as it is: is R transposed, or from the right "
-                    "camera to the left one?"
-                )
-        return ""
+    def _explained(self, left: Points, right: Points, own: PairGeometry) -> str:
+        """What makes rows agree best, where something does: another moment of one image, or the rotation's inverse."""
+        rig, before = self._rig, self._before
+        tried: list[tuple[Points | None, Points | None, StereoRig, str]] = []
+        if before is not None:
+            tried.append((_points(before.left, rig), right, rig, "where right images are taken to come a frame late"))
+            tried.append((left, _points(before.right, rig), rig, "where right images are taken to come a frame early"))
+        if not rig.is_rectified:
+            tried.append((left, right, replace(rig, R=rig.R.T), "with the inverse of the calibration's rotation"))
+        best, said = 1.0, ""
+        for one, two, other, how in tried:
+            with suppress(CalibrationError):
+                found = pair_geometry(other, one, two, self._rows) if one and two else PairGeometry(0)
+                share = found.off_rows / max(found.matches, 1)
+                if found.conclusive and not found.rows_differ and share < best and most(own.off_rows, found.off_rows):
+                    best, said = share, f"{found.off_rows} of {found.matches} {how}"
+        cause = f"left and right image are not of one moment: {ONE_MOMENT}"
+        if "inverse" in said:
+            cause = "is R transposed, or from the right camera to the left one, or are the images not of one moment?"
+        return said and f"rows of {own.off_rows} of {own.matches} features differ, and {said}; {cause}"
 
     def copied(self, frame: StereoFrame, checksum: Checksum | None) -> tuple[Checksum | None, str]:
         """Why the right image is a copy, which measures nothing (empty if it is none), and the frame's checksum.
@@ -270,8 +281,10 @@ def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
             cause = f"{before}, or leave the distortion out"
         else:
             cause = f"the lenses' distortion is missing in it; or {before}"
+        if found.shown < -0.5:  # guard: between images without it, 0, and with the opposite, -1
+            cause = "is the sign of the distortion exchanged?"
         return (
-            f"rows of left and right image show {100 * max(found.shown, 0.0):.0f} % of what the calibration's "
+            f"rows of left and right image show {100 * found.shown:.0f} % of what the calibration's "
             f"rectification does to rows: {cause}"
         )
     else:

@@ -8,7 +8,7 @@ import numpy as np
 
 from slam.data import StereoFeatures
 from slam.geometry.arrays import BoolArray
-from slam.geometry.camera import baseline_doubt
+from slam.geometry.camera import baseline_doubt, in_units
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, log
 from slam.input.warnings import REPEATED
@@ -113,8 +113,8 @@ def _unexplained(record: RunRecord, rig: StereoRig, driving: bool) -> str:
         apart += f" and what they see is {_rounded(depth)} m away in the median"
     if rig.baseline > _WIDEST[driving]:
         return (
-            f"by the calibration {apart}, which no hand carries: a baseline in another unit (unit=cm, unit=mm), or a "
-            "vehicle's camera without --kind driving"
+            f"by the calibration {apart}, which no hand carries: a baseline in another unit"
+            f"{in_units(rig.baseline)}, or a vehicle's camera without --kind driving"
         )
     moved, vehicle = "", "" if driving else "a vehicle's camera without --kind driving, "
     if len(speeds):
@@ -138,7 +138,7 @@ def scale_doubt(record: RunRecord, rig: StereoRig, driving: bool = False) -> str
     if len(speeds) < _LEAST_CHANGES or not np.isfinite(depth):
         return ""
     apart = f"by the calibration the cameras are {rig.baseline:.3g} m apart"
-    asked = f"{apart}; is that in metres? (of a recording, unit=cm or unit=mm)"
+    asked = f"{apart}; is that in metres?{in_units(rig.baseline)}"
     speed = float(np.median(speeds[:, 1]))
     if speed <= _FASTEST[driving] and depth >= _NEAREST[driving]:
         return asked if rig.baseline > _WIDEST[driving] else ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from slam.errors import ConfigurationError
+from slam.geometry.camera import UNITS
 from slam.query import number, read_query, word
 
 #: Options of every format whose calibration is in a file that can be named.
@@ -21,7 +22,7 @@ WIDEST_TOLERANCE = 10.0
 
 _WORDS: dict[str, dict[str, Any]] = {
     "kind": {"driving": "driving", "handheld": "handheld"},
-    "unit": {"m": 1.0, "cm": 0.01, "mm": 0.001},  # in metres
+    "unit": UNITS,
     "layout": {"sbs": "sbs"},  # side by side
     **{name: {"yes": True, "no": False} for name in ("rectified", "fisheye", "swap")},
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
@@ -12,12 +13,14 @@ import numpy as np
 
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.files import expanded
-from slam.geometry.camera import PinholeCamera
+from slam.geometry.camera import PinholeCamera, baseline_doubt, size_doubt
 from slam.geometry.rig import NOT_SIDE_BY_SIDE, StereoRig
 from slam.geometry.se3 import Array, inverse, is_rotation, pose, so3_exp
 from slam.sequences.calibration import Entries, array, naming, plain_name, read_entries
 from slam.sequences.images import Size, recorded_size, size_text
 from slam.sequences.options import value_of
+
+logger = logging.getLogger("slam.sequences")
 
 _ENDINGS = (".yaml", ".yml", ".xml", ".json", ".conf")
 _USUAL = (
@@ -55,7 +58,7 @@ def load_rig(
     rectified: bool = False,
     fisheye: bool = False,
 ) -> StereoRig:
-    """The rig of a calibration.
+    """The rig of a calibration; a length of the baseline or a size that no rig has is logged.
 
     Args:
         *paths: one file: OpenCV's (YAML, XML, JSON), Kalibr's camchain, ORB-SLAM's or stella_vslam's settings, ZED's
@@ -63,7 +66,7 @@ def load_rig(
             and baseline in YAML. Two files: OpenCV's intrinsics and extrinsics, ROS's or EuRoC's of the left and the
             right camera. Or the folder where they are under their usual names.
         size: width and height of the images [px], where the file names none.
-        unit: of length in an OpenCV file: ``"m"``, ``"cm"`` or ``"mm"``.
+        unit: of length in an OpenCV file: ``"m"``, ``"cm"``, ``"mm"`` or ``"in"``, inches.
         rectified: take the rectified cameras (``P1``, ``P2``).
         fisheye: the distortion in an OpenCV file is ``cv2.fisheye``'s.
 
@@ -83,6 +86,8 @@ def load_rig(
     rig = read_rig(files, size, options)
     if rig.turns:  # and the images are not
         raise CalibrationError(NOT_SIDE_BY_SIDE)
+    for doubt in filter(None, (baseline_doubt(rig.baseline), size_doubt(rig.left, rig.right))):
+        logger.warning("%s: %s", " and ".join(map(str, files)), doubt)
     return rig
 
 

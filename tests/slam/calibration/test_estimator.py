@@ -99,8 +99,8 @@ def test_a_common_error_of_the_focal_lengths_is_found_in_a_turn(theta):
 @pytest.mark.parametrize(
     ("share", "wrong", "words"),
     [
-        (1.2, {}, "% shorter than the calibration's: is it of this camera"),
-        (0.8, {}, "% longer than the calibration's: is it of this camera"),
+        (1.1, {}, "% shorter than the calibration's: is it of this camera"),
+        (0.9, {}, "% longer than the calibration's: is it of this camera"),
         (1.0, {"left_k1": 0.2, "right_k1": 0.2}, "a lens distortion that is not in the calibration (k1 about -0."),
         (1.0, {"right_cx": 0.01}, "disparities about"),
         (1.0, {"roll": 0.03}, "a right camera that is turned by about 1.7°"),

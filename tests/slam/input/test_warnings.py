@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from dataclasses import replace
 
@@ -265,7 +266,26 @@ def test_a_transposed_rotation_is_named():
     rig = unlike_cameras([0.02, 0.12, -0.02], (-0.1, 0.02), (-0.12, 0.02))
     frames = every(3, seen_by_both(rig.left, rig.right, rig.R))
     (line,) = lines(frames, rig=slam.StereoRig(rig.left, rig.right, rig.R.T, rig.b))
-    assert "agree with the inverse of the calibration's rotation" in line
+    assert "with the inverse of the calibration's rotation" in line and "is R transposed" in line
+
+
+@pytest.mark.parametrize("early", [False, True])
+def test_rows_that_agree_with_the_frame_before_are_of_two_moments(early):
+    """They were taken for a rotation that is transposed."""
+    rig = unlike_cameras([0.02, 0.12, -0.02], (-0.1, 0.02), (-0.12, 0.02))
+    see = seen_by_both(rig.left, rig.right, rig.R)
+    seen = [see(*(np.roll(image, 7 * k, axis=0) for image in (FRAME.left, FRAME.right))) for k in range(4)]
+    moved = [replace(FRAME, index=k, stamp=0.05 * k, left=a, right=b) for k, (a, b) in enumerate(seen)]
+    pairs = [replace(a, right=b.right) if early else replace(b, right=a.right) for a, b in itertools.pairwise(moved)]
+    (line,) = lines(pairs, rig=rig)
+    assert f"to come a frame {'early' if early else 'late'}" in line
+
+
+def test_a_distortion_of_the_other_sign_is_named():
+    """It was taken for images that are rectified twice."""
+    other = [replace(_LENS, distortion=tuple(-d for d in _LENS.distortion))] * 2
+    (line,) = lines(every(3, seen_by_both(*other, np.eye(3))), rig=ALIKE)
+    assert "the sign of the distortion exchanged" in line
 
 
 def test_images_undistorted_but_not_rectified_before_are_named():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,6 +13,7 @@ import pytest
 
 import slam
 from slam.errors import CalibrationError, ConfigurationError, SlamError
+from slam.geometry.camera import in_units
 from slam.sequences import open_sequence
 
 SIZE = (64, 48)
@@ -168,6 +170,17 @@ def test_the_same_rig_in_the_words_of_many_programs_and_people(tmp_path: Path, n
             load(tmp_path, name, unit="cm")
 
 
+@pytest.mark.parametrize(("length", "units"), [(120.0, "cm mm"), (12.0, "cm in"), (4.73, "cm in"), (0.1, "")])
+def test_a_unit_that_is_proposed_gives_the_baseline_that_is_said(tmp_path: Path, build, caplog, length, units):
+    entries = build.stereo_entries(length)
+    build.write_storage(tmp_path / "calibration.yaml", entries)
+    proposed = re.findall(r"unit=(\w+) makes it (\S+) m", in_units(slam.load_rig(tmp_path, size=SIZE).baseline))
+    assert [unit for unit, _ in proposed] == units.split()
+    assert ("m apart by their calibration: is it in metres?" in caplog.text) == (length > 10)
+    for unit, metres in proposed:
+        assert slam.load_rig(tmp_path, size=SIZE, unit=unit).baseline == pytest.approx(float(metres), rel=0.01)
+
+
 @pytest.mark.parametrize("fixture", ["euroc", "kitti", "raw", "two_folders"])
 def test_a_folder_s_calibration_is_that_of_its_sequence(fixture: str, request) -> None:
     folder: Path = request.getfixturevalue(fixture)
@@ -233,7 +246,7 @@ def test_distortions_of_every_kind_and_length(tmp_path: Path, build: SimpleNames
 REFUSED = [
     (f"{FIVE}baseline: 0.2\nk1: 0.1\n", "names distortion, but only one camera"),
     ("fx: 0.8\nfy: 0.8\ncx: 0.5\ncy: 0.5\nbaseline: 0.2\n", "a focal length of 0.8 px for images 64 px wide: is it"),
-    (f"{FIVE}baseline: 7.9\nunit: inch\n", "unit must be m or cm or mm, got 'inch'"),
+    (f"{FIVE}baseline: 7.9\nunit: inch\n", "unit must be m or cm or mm or in, got 'inch'"),
     (f"{FIVE}baseline: -0.12\n", "fx, fy and baseline must be positive"),
     (json.dumps({"K1": M, "D1": [-0.3, 0.1, 0, 0], "K2": M, "R": EYE, "T": [-0.2, 0, 0]}), "D2 is missing"),
     (OAK.replace('"toCameraSocket": 2', '"toCameraSocket": 0'), "depthai's, but says nothing of how the pair stands"),

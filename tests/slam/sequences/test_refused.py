@@ -116,6 +116,12 @@ def test_images_that_never_pair(euroc, kitti, two_folders, build):
     refused(two_folders, SequenceError, r"left has 5 images and .*right has 6")
 
 
+@pytest.mark.parametrize(("step", "words"), [(0, "6 images stand still"), (-1, "6 images run backwards")])
+def test_times_that_do_not_go_on_are_named(two_folders, step, words):
+    (two_folders / "times.txt").write_text("".join(f"{100 + i * step}\n" for i in range(6)))
+    refused(two_folders, SequenceError, words)
+
+
 def test_rows_that_are_no_stamps_or_in_wrong_order_cost_their_frames(euroc, kitti):
     table = euroc / "mav0" / "cam0" / "data.csv"
     lines = table.read_text().splitlines()
