@@ -349,7 +349,7 @@ class StereoSlam:
     @property
     def warnings(self) -> list[str]:
         """Warnings about images, stamps, baseline or calibration, one line each (see `slam.input`)."""
-        said, doubt = self._extractor.input_warnings, self.doubt
+        said, doubt = self._extractor.input_warnings, self.doubt or self.calibration.warning
         lines = [*said.lines, *filter(None, [said.repeated])]
         return lines if doubt in ("", *lines) else [*lines, doubt]
 

@@ -18,25 +18,27 @@ from slam.geometry.se3 import Array
 #: guard: Least gain of twice the log-likelihood. With unlimited data it is the square of the error in standard
 #: deviations of the prior, so this is 7 of them. Over the recordings and worlds at hand it is up to 28; with the lens
 #: distortion of three recordings left out it is 230 to 790.
-_GAIN = 49.0
+GAIN = 49.0
 
-#: guard: The same of the focal length alone, 4 of them: what a path is too long by. It is up to 7 on recordings and
-#: worlds at hand; of one that is a tenth wrong 12 to 220 where the camera turns, less on straight roads.
-_FOCAL_GAIN = 16.0
+#: guard: The same of the focal length alone for a warning, 4 of them: what a path is too long by. It is up to 7 on the
+#: recordings and worlds at hand; of one that is a tenth wrong 12 to 220 where the camera turns, less on straight roads.
+FOCAL_WARNING = 16.0
 
 _DISTORTION = ("left_k1", "right_k1"), ("left_k2", "right_k2")
 
 
-def conflict(model: RigModel, covariance: Array, evidence: Evidence, whose: str = "calibration") -> str:
+def conflict(
+    model: RigModel, covariance: Array, evidence: Evidence, whose: str = "calibration", focal: float = GAIN
+) -> str:
     """What is wrong with a calibration, in a line; empty where no cause alone explains the images far better.
 
     `covariance` (n, n) is that of the prior, which allows the errors that calibrations have; `evidence` is of the n
-    parameters less the prior's mean.
+    parameters less the prior's mean. A focal length is named from the gain `focal` on, other causes from `GAIN`.
     """
-    focal, *others = _causes(model, covariance, evidence, whose)
-    gains = {words: gain for gain, words in others if gain > _GAIN}
-    if focal[0] > _FOCAL_GAIN:
-        gains[focal[1]] = focal[0]
+    least = (focal, *[GAIN] * 4)
+    gains = {
+        words: gain for bound, (gain, words) in zip(least, _causes(model, covariance, evidence, whose)) if gain > bound
+    }
     return max(gains, key=lambda words: gains[words], default="")
 
 

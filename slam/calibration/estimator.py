@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from slam.calibration.config import SelfCalibrationConfig
-from slam.calibration.conflict import conflict
+from slam.calibration.conflict import FOCAL_WARNING, GAIN, conflict
 from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.calibration.pairs import View, match, noise_variances, pair_evidence, pair_of, parallax
 from slam.calibration.posterior import (
@@ -112,12 +112,21 @@ class SelfCalibration:
     @property
     def doubt(self) -> str:
         """What the images contradict by far in the calibration, in a line; empty where they do not."""
+        return self._contradicted(GAIN)
+
+    @property
+    def warning(self) -> str:
+        """As `doubt`, but also a focal length that the images contradict less surely."""
+        return self._contradicted(FOCAL_WARNING)
+
+    def _contradicted(self, focal: float) -> str:
         rows, moved = self._rows.total(), self._moved()
         if rows is None:
             return ""
         found = rows if moved is None else rows + moved
         found = found._replace(e=found.e - found.S @ self._prior.mean)
-        return conflict(self.model, self._prior.covariances[-1], found, f"{'kept ' if self._kept else ''}calibration")
+        whose = f"{'kept ' if self._kept else ''}calibration"
+        return conflict(self.model, self._prior.covariances[-1], found, whose, focal)
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Apply the present posterior to features from now on; returns the change, or None.

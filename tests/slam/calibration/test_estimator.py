@@ -99,8 +99,8 @@ def test_a_common_error_of_the_focal_lengths_is_found_in_a_turn(theta):
 @pytest.mark.parametrize(
     ("share", "wrong", "words"),
     [
-        (1.1, {}, "% shorter than the calibration's: is it of this camera"),
-        (0.9, {}, "% longer than the calibration's: is it of this camera"),
+        (1.2, {}, "% shorter than the calibration's: is it of this camera"),
+        (0.8, {}, "% longer than the calibration's: is it of this camera"),
         (1.0, {"left_k1": 0.2, "right_k1": 0.2}, "a lens distortion that is not in the calibration (k1 about -0."),
         (1.0, {"right_cx": 0.01}, "disparities about"),
         (1.0, {"roll": 0.03}, "a right camera that is turned by about 1.7°"),
@@ -110,6 +110,13 @@ def test_what_no_calibration_of_this_camera_has_is_named(share, wrong, words):
     camera = CAR.left
     rig = type(CAR).rectified_pair(share * camera.fu, camera.u0, camera.v0, CAR.baseline, CAR.width, CAR.height)
     assert words in quarter_turn(parameters(**wrong), rig).doubt
+
+
+@pytest.mark.parametrize(("share", "words"), [(1.1, "% shorter than"), (0.9, "% longer than"), (1.0, "")])
+def test_a_focal_length_that_is_a_tenth_wrong_is_warned_of(share, words):
+    rig = CAR.rectified_pair(share * CAR.left.fu, CAR.left.u0, CAR.left.v0, CAR.baseline, CAR.width, CAR.height)
+    said = quarter_turn(parameters(), rig).warning
+    assert words in said and bool(said) == bool(words)
 
 
 def test_on_a_straight_road_a_common_error_of_the_focal_lengths_stays_unknown():
