@@ -261,6 +261,8 @@ class _Run:
         tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving, own, recorded)
         if doubt and not tracking:
             logger.warning("%s", doubt)
+        if isinstance(self.system, StereoSlam) and not self.system.doubt and self.system.calibration.warning:
+            logger.warning("%s", self.system.calibration.warning)
         return {
             "frames": len(record.numbers),
             "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
