@@ -27,18 +27,15 @@ FOCAL_WARNING = 16.0
 _DISTORTION = ("left_k1", "right_k1"), ("left_k2", "right_k2")
 
 
-def conflict(
-    model: RigModel, covariance: Array, evidence: Evidence, whose: str = "calibration", focal: float = GAIN
-) -> str:
+def conflict(model: RigModel, covariance: Array, evidence: Evidence, which: str = "", focal: float = GAIN) -> str:
     """What is wrong with a calibration, in a line; empty where no cause alone explains the images far better.
 
     `covariance` (n, n) is that of the prior, which allows the errors that calibrations have; `evidence` is of the n
     parameters less the prior's mean. A focal length is named from the gain `focal` on, other causes from `GAIN`.
+    `which` says which calibration it is: "kept ", or nothing.
     """
-    least = (focal, *[GAIN] * 4)
-    gains = {
-        words: gain for bound, (gain, words) in zip(least, _causes(model, covariance, evidence, whose)) if gain > bound
-    }
+    causes = _causes(model, covariance, evidence, f"{which}calibration")  # the focal length first
+    gains = {words: gain for least, (gain, words) in zip([focal, *[GAIN] * 4], causes) if gain > least}
     return max(gains, key=lambda words: gains[words], default="")
 
 

@@ -125,8 +125,7 @@ class SelfCalibration:
             return ""
         found = rows if moved is None else rows + moved
         found = found._replace(e=found.e - found.S @ self._prior.mean)
-        whose = f"{'kept ' if self._kept else ''}calibration"
-        return conflict(self.model, self._prior.covariances[-1], found, whose, focal)
+        return conflict(self.model, self._prior.covariances[-1], found, "kept " if self._kept else "", focal)
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Apply the present posterior to features from now on; returns the change, or None.
