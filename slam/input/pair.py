@@ -25,6 +25,7 @@ _SHOWN_PLAIN = 0.9  # guard: the same of cameras that are rectified but for lens
 #: Disparities below this count as zero [px].
 NO_DISPARITY = _TOLERANCE
 
+_MOVES = 1e-3  # numerics: [px] root mean square, below which a change of rows is rounding
 _SAMPLE = 8  # fixed: matches that any fundamental matrix can be made to fit
 _SIGMAS = 5.0  # guard: a chance of 3e-7 to be wrong
 
@@ -127,10 +128,10 @@ def _shown(rig: StereoRig, uv_left: Array, uv_right: Array, left: NDArray, right
     good = (status[:, 0] > 0) & (np.abs(tracked[:, 0] - uv_right).max(axis=1) < _TOLERANCE)
     a, b = uv_left[good], tracked[good, 0].astype(float)
     rectified, believed = _offsets(rig, a, b)[1], _SHOWN_PLAIN if plain.is_rectified else _SHOWN
-    return min(_share(before, rectified, believed) for before in (b[:, 1] - a[:, 1], _offsets(plain, a, b)[1]))
+    return min(share_shown(before, rectified, believed) for before in (b[:, 1] - a[:, 1], _offsets(plain, a, b)[1]))
 
 
-def _share(before: Array, after: Array, believed: float) -> float:
+def share_shown(before: Array, after: Array, believed: float) -> float:
     """Share of the change from row differences `before` to those `after` (N,) [px] that is seen, by least squares.
 
     1 where it is not certainly less than what is `believed`, or rows do not agree before.
@@ -140,7 +141,7 @@ def _share(before: Array, after: Array, believed: float) -> float:
     good = np.minimum(np.abs(before), np.abs(after)) < _TOLERANCE  # NaN is not
     before, change = before[good], (before - after)[good]
     whole = float(change @ change)
-    if len(change) <= _SAMPLE or whole == 0:
+    if len(change) <= _SAMPLE or whole < len(change) * _MOVES**2:
         return 1.0
     share = float(change @ before) / whole
     sigma = float(np.sqrt(np.square(before - share * change).mean() / whole))

@@ -15,7 +15,7 @@ from slam.data import StereoFeatures
 from slam.errors import SequenceError
 from slam.geometry.camera import PinholeCamera
 from slam.input import warnings
-from slam.input.pair import pair_geometry, points_of
+from slam.input.pair import pair_geometry, points_of, share_shown
 from slam.input.warnings import InputWarnings
 from slam.models import models_for
 
@@ -286,6 +286,14 @@ def test_a_distortion_of_the_other_sign_is_named():
     other = [replace(_LENS, distortion=tuple(-d for d in _LENS.distortion))] * 2
     (line,) = lines(every(3, seen_by_both(*other, np.eye(3))), rig=ALIKE)
     assert "the sign of the distortion exchanged" in line
+
+
+def test_rounding_is_no_share_of_what_rectification_does():
+    """Without lenses the change that they make was nothing but rounding, and rows showed billions of per cent of it."""
+    rng = np.random.default_rng(0)
+    before = rng.normal(0.0, 0.3, 100)
+    assert share_shown(before, (1 + 1e-13) * before, 0.5) == 1.0
+    assert share_shown(before, 2 * before, 0.5) == pytest.approx(-1.0)
 
 
 def test_images_undistorted_but_not_rectified_before_are_named():

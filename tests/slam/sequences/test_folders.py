@@ -305,6 +305,9 @@ def test_a_true_path_is_given_by_an_option(two_folders: Path) -> None:
     truth.write_tum(two_folders / "true.txt")
     found = open_sequence(f"{two_folders}?truth=true.txt").ground_truth
     np.testing.assert_allclose(found.poses, truth.poses, atol=1e-8)
+    slam.Trajectory(stamps * 1e3, truth.poses).write_tum(two_folders / "ms.txt")
+    (said,) = open_sequence(f"{two_folders}?truth=ms.txt").warnings[-1:]
+    assert f"1 of {len(stamps)} images have a true pose" in said
     slam.Trajectory(stamps + 1e6, truth.poses).write_tum(two_folders / "late.txt")
     for name, line in (("late.txt", "no pose is within"), ("none.txt", "none.txt")):
         with pytest.raises(SlamError, match=line):
