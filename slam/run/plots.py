@@ -218,7 +218,8 @@ def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
     view = "above" if shown[1] == 2 else "the side"
     axis.set(title=f"Path from {view}, online (dot: start)", xlabel=across, ylabel=ahead)
     if not extent.any():
-        axis.set(xlim=(-1, 1), ylim=(-1, 1))
+        axis.update_datalim([(-1.0, -1.0), (1.0, 1.0)])
+        axis.autoscale_view()
     axis.set_aspect("equal", adjustable="datalim")
     axis.legend(framealpha=0.8)
     axis.locator_params(axis="x", nbins=6)

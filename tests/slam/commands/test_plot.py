@@ -39,6 +39,13 @@ def test_runs_with_and_without_truth_are_drawn(runs, tmp_path, kind):
         assert (tmp_path / name).stat().st_size > 1000
 
 
+def test_a_path_that_is_one_dot_is_drawn_without_a_word(tmp_path, caplog):
+    config = SystemConfig.for_kind("handheld")
+    run(open_sequence("synthetic:desk?frames=1"), RunOptions("ekf", "surf", config, tmp_path / "a"))
+    plot_runs([tmp_path / "a"], tmp_path / "a.png", "summary")
+    assert not caplog.messages
+
+
 @pytest.mark.parametrize(
     ("folder", "file", "kind", "words"),
     [
