@@ -130,8 +130,9 @@ def results_of(
         )
     online, steps = path.select(measured), np.diff(path.positions, axis=0)
     truth, noise = sequence.ground_truth, getattr(sequence, "truth_noise", TruthNoise())
-    given = truth is not None and noise == TruthNoise() and sequence.format != "synthetic"  # and taken as exact
-    doubt, wrong = truth_doubt(online, truth) if given else ("", False)
+    doubt, wrong = "", False
+    if truth is not None and noise == TruthNoise() and sequence.format != "synthetic":  # it is taken as exact
+        doubt, wrong = truth_doubt(online, truth)
     if doubt:
         logger.warning("%s", doubt)
     speeds = np.linalg.norm(steps, axis=1) / np.diff(path.stamps)

@@ -139,7 +139,9 @@ def _fit(own: Trajectory, truth: Trajectory, shift: float, free: str = "scale bo
     size, turn = _rms(ta), max(_rms(wa), _TURN)
     if size < _STILL:
         return None
-    R, lever, scale, J = np.eye(3), np.zeros(3), 1.0, A[:, :3, :3] - np.eye(3)
+    R: Array = np.eye(3)
+    lever: Array = np.zeros(3)
+    scale, J = 1.0, A[:, :3, :3] - np.eye(3)
     rows = J.reshape(-1, 3)
     prior = _LEVER_PRIOR * len(J) * np.eye(3)
     for _ in range(_ROUNDS if free else 0):  # each in turn, given the others
