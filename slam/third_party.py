@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from numbers import Real
-from traceback import walk_tb
 from typing import Any
 
 import numpy as np
 
 from slam.checks import LATEST_STAMP, is_rigid
 from slam.data import Estimate, Patches, Prediction, UpdateReport, UpdateStatus
-from slam.errors import PartError, SlamError, cause, text_of
+from slam.errors import PartError, SlamError, cause
 
 _OURS = ("slam", "backends", "frontends", "builtins")
 
@@ -72,32 +71,18 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
 
 @contextmanager
 def named_failures(place: str, *parts: object) -> Iterator[None]:
-    """Turn exceptions that a third-party part raised, or that its return values may have caused, into `PartError`.
+    """Turn exceptions that a third-party part raised, or that its return values have caused, into `PartError`.
 
     If all parts are our own, exceptions pass unchanged. `place` is the present operation, for the message.
     """
-    foreign = [part for part in parts if type(part).__module__.partition(".")[0] not in _OURS]
+    foreign = [type(part).__name__ for part in parts if type(part).__module__.partition(".")[0] not in _OURS]
     try:
         yield
     except SlamError as error:
-        if any(str(error).startswith(f"{type(part).__name__}.") for part in foreign):  # an answer that was `checked`
+        if any(str(error).startswith(f"{name}.") for name in foreign):  # an answer that was `checked`
             raise SlamError(f"{place}: {error}") from error
         raise
-    except (Exception, SystemExit) as error:  # whatever a third-party class does
-        *_, (last, _) = walk_tb(error.__traceback__)
-        by_part = last.f_globals.get("__name__") in [type(part).__module__ for part in foreign]
-        if not foreign or (isinstance(error, SystemExit) and not by_part):  # as of a signal handler elsewhere
+    except Exception as error:  # whatever a third-party class does
+        if not foreign:
             raise
-        part, call = next(((part, f".{call}") for part in foreign if (call := _call(error, part))), (foreign[0], ""))
-        failed = "failed" if call else "may have failed"  # what it answered may have broken something of ours
-        raise PartError(f"{place}: {type(part).__name__}{call} {failed}: {cause(error)}") from error
-
-
-def _call(error: BaseException, part: object) -> str:
-    """The method of `part` that raised an exception, or was called wrongly; empty for none."""
-    for frame, _ in walk_tb(error.__traceback__):
-        first, name = frame.f_code.co_varnames[:1], frame.f_code.co_name
-        if first and frame.f_locals.get(first[0]) is part and hasattr(part, name):
-            return name
-    name, dot, rest = text_of(error).partition(".")
-    return rest.partition("(")[0] if dot and isinstance(error, TypeError) and name == type(part).__qualname__ else ""
+        raise PartError(f"{place}: {' or '.join(foreign)} failed: {cause(error)}") from error

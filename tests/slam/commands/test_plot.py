@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,6 @@ from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.geometry.trajectory import TruthNoise
 from slam.run.options import RunOptions
-from slam.run.plots import KINDS
 from slam.run.plots import plot_folders as plot_runs
 from slam.run.run_data import RunData, pose_errors
 from slam.run.runner import run
@@ -26,17 +24,6 @@ def runs(tmp_path_factory):
     for name, backend in (("a", "ekf"), ("b", "smoother")):
         run(open_sequence(WORLD), RunOptions(backend, "surf", config, root / name))
     return root
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_runs_with_and_without_truth_are_drawn(runs, tmp_path, kind):
-    shutil.copytree(runs / "a", tmp_path / "a")
-    (tmp_path / "a" / "truth.txt").unlink()
-    without = tmp_path / "a"
-    for name, folders in (("a.png", [without]), ("b.pdf", [without, runs / "b"]), ("c.svg", [runs / "b"])):
-        plot_runs(folders, tmp_path / name, kind)
-        assert (tmp_path / name).stat().st_size > 1000
 
 
 def test_a_path_that_is_one_dot_is_drawn_without_a_word(tmp_path, caplog):

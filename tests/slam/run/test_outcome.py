@@ -91,16 +91,6 @@ def test_times_that_are_too_short_are_doubted():
     assert "fps=…" in said
 
 
-def test_missing_right_images_are_the_cause_where_most_of_these_frames_have_none():
-    run = record(10, features=(200, 0))
-    run.without_right.extend(range(8, 13))
-    assert "likely cause: 10 of these 10 frames have no right image or follow such" in outcome(run, RIG)
-    assert "calibration" not in outcome(run, RIG)
-    run = record(10)
-    run.without_right.extend(range(5))
-    assert "no right image" not in outcome(run, RIG)
-
-
 def along(step, times=30, **more):
     """A camera that goes on by the same step [m] every tenth of a second."""
     poses = [exp(np.array([0, 0.002 * k, 0, *(k * np.array(step))])) for k in range(times)]

@@ -15,19 +15,6 @@ def threads() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.name.startswith("prefetch")}
 
 
-def test_an_item_is_made_while_the_one_before_is_used():
-    made = threading.Event()
-
-    def items():
-        yield 0
-        made.set()
-        yield 1
-
-    for item in prefetch(items()):
-        if item == 0:
-            assert made.wait(10)
-
-
 def test_no_more_than_asked_for_is_made_beforehand():
     before = threads()
     made = []
