@@ -64,10 +64,7 @@ def _range_fault(value: Any, limits: tuple[float, float] | None, positive: bool)
     return "" if zero or least <= number <= most else f"{text}, from {least:g} to {most:g}"
 
 
-@lru_cache(maxsize=64)
-def _hints(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind)
-
+_hints = lru_cache(maxsize=64)(get_type_hints)
 
 #: By type: what a value is an instance of, and that in words.
 _TYPES: dict[Any, tuple[Any, str]] = {
