@@ -238,11 +238,9 @@ def remove_file(path: Path) -> None:
 
 
 def _require_target(path: Path, error: type[SlamError]) -> None:
-    """Raise `error` where there is no folder for a file, or something else at its place: a device, a pipe."""
+    """Raise `error` where there is something else at a file's place: a device, a pipe."""
     if "\0" in str(path):
         raise error(f"{path}: no possible file name")
-    if not path.parent.is_dir():
-        raise error(f"{path}: cannot be written: there is no folder {path.parent}")
     with suppress(FileNotFoundError):
         if not stat.S_ISREG(path.stat().st_mode):  # raises for links in a circle
             raise error(f"{path}: cannot be written: there is something that is not a regular file")
@@ -250,7 +248,7 @@ def _require_target(path: Path, error: type[SlamError]) -> None:
 
 @contextmanager
 def whole_file(path: str | Path, error: type[SlamError] = SlamError) -> Iterator[BinaryIO]:
-    """A file to write to, which replaces the old one only when it is complete and on the disk.
+    """A file to write to, which replaces the old one only when it is complete and on the disk; its folder is made.
 
     Raises `error` where it cannot be written; nothing is left of it then.
     """
@@ -258,6 +256,7 @@ def whole_file(path: str | Path, error: type[SlamError] = SlamError) -> Iterator
     try:
         _require_target(place, error)
         place = place.resolve()  # a link stays a link
+        place.parent.mkdir(parents=True, exist_ok=True)
         beside = place.with_name(f".{secrets.token_hex(8)}.part")
         with beside.open("xb") as file:
             temporary = beside
