@@ -1,61 +1,11 @@
-"""Items made ahead: the same ones in the same order, exceptions in their place, no thread left behind."""
+"""Items made ahead leave no thread behind."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-import threading
 
 import pytest
-
-from slam.runtime.threads import prefetch
-
-
-def threads() -> set[threading.Thread]:
-    return {thread for thread in threading.enumerate() if thread.name.startswith("prefetch")}
-
-
-def test_an_item_is_made_while_the_one_before_is_used():
-    made = threading.Event()
-
-    def items():
-        yield 0
-        made.set()
-        yield 1
-
-    for item in prefetch(items()):
-        if item == 0:
-            assert made.wait(10)
-
-
-def test_no_more_than_asked_for_is_made_beforehand():
-    before = threads()
-    made = []
-
-    def items():
-        for k in range(50):
-            made.append(k)
-            yield k
-
-    work = prefetch(items(), depth=2)
-    assert next(work) == 0
-    assert len(made) <= 5
-    work.close()
-    assert threads() <= before
-
-
-def test_an_exception_comes_where_its_item_would():
-    before = threads()
-
-    def items():
-        yield 1
-        raise ValueError("broken")
-
-    work = prefetch(items())
-    assert next(work) == 1
-    with pytest.raises(ValueError, match="broken"):
-        next(work)
-    assert threads() <= before
 
 
 @pytest.mark.parametrize("source", ["prefetch(endless())", "LiveFrames(endless(), paced=False)"])
