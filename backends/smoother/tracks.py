@@ -11,11 +11,13 @@ import numpy as np
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
 from backends.smoother.landmarks import VARIABLE
 from backends.smoother.state import SmootherState
-from slam.geometry.se3 import Array, transform
+from slam.geometry.se3 import Array, inverse, transform
+from slam.window.motion import STANDS, is_first
 
 #: Times of variables, as gtsam's stubs have them.
 Stamps = dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex]
 
+_LOOSE = np.repeat([3.0, 100.0], 3)  # numerics: deviations [rad], [m] of a motion that is unknown
 _LONGEST = 64  # cost: measurements in a factor of what was a variable; its cost grows with their square
 
 
@@ -68,19 +70,25 @@ class Tracks:
         self._solved = -1  # number of the newest pose that was solved for
 
     def add_pose(self, problem: GraphProblem, s: SmootherState, number: int, first: int) -> None:
-        """A pose, and its tie to the one before it, if it is not the first one."""
-        row = s.of(number)
-        tie = s.ties[row]
-        if tie is not None and number != first:
-            unknown = tie.times is not None and np.isnan(tie.times[0])
-            if tie.times is None or (not unknown and number - 2 < first):
-                factor = self._make.tie(number - 1, number, tie.relative, tie.covariance)
-            else:
-                keys = [pose_key(i) for i in range(number - (1 if unknown else 2), number + 1)]
-                factor = self._make.motion(keys, np.diff(tie.times), tie.over)
-            problem.factors.add(factor)
-        problem.values.insert(pose_key(number), to_pose3(problem.to_graph @ s.poses[row]))
+        """A pose, and its motion since the one before it, if it is not the first one."""
+        if number > first:
+            problem.factors.add(self._motion(s, number, first))
+        problem.values.insert(pose_key(number), to_pose3(problem.to_graph @ s.poses[s.of(number)]))
         problem.stamps[pose_key(number)] = float(number)
+
+    def _motion(self, s: SmootherState, number: int, first: int) -> gtsam.NonlinearFactor:
+        """What the motion model says of a pose: its velocity is that between the two poses before, but for noise.
+
+        Where the graph has but one of these two, or the motion is unknown, the pose is hardly held where it is.
+        """
+        row, (dt, before) = s.of(number), s.intervals(number)
+        if s.rests[row]:
+            return self._make.tie(number - 1, number, np.eye(4), STANDS)
+        if s.free[row - 1 : row + 1].any() or (not is_first(before, dt) and number - 2 < first):
+            return self._make.tie(number - 1, number, inverse(s.poses[row - 1]) @ s.poses[row], _LOOSE)
+        count = 2 if is_first(before, dt) else 3
+        keys = [pose_key(i) for i in range(number + 1 - count, number + 1)]
+        return self._make.motion(keys, np.array([before or np.nan, dt]))
 
     def add_rows(self, problem: GraphProblem, s: SmootherState, number: int, first: int, begin: int = 0) -> None:
         """What was measured from a pose, from some row on."""
