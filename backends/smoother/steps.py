@@ -23,7 +23,7 @@ from slam.window.gating import MIN_CONSENSUS
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.stereo import RectifiedMeasurement, relative_covariance
 
-_ALONE = np.zeros((12, 12)), np.zeros((6, 12))  # `pair` and `shared` of a first pose
+_ALONE: tuple[Array, Array] = np.zeros((12, 12)), np.zeros((6, 12))  # `pair` and `shared` of a first pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Steps(RectifiedMeasurement):
     # --- prediction ---
 
     def predicted(self, s: SmootherState, stamp: float, rests: bool = False) -> SmootherState:
-        """With the newest frame at `stamp` [s], by the motion model. The very first one is a pose of the graph."""
+        """With the newest frame at `stamp` [s], by the motion model."""
         s = replace(
             s, stamps=np.append(s.stamps, stamp), rests=np.append(s.rests, rests), free=np.append(s.free, False),
             sights=(*s.sights, Sight.none()), measured=False,
@@ -57,8 +57,8 @@ class Steps(RectifiedMeasurement):
         own = 0.5 * (own + own.T)
         shared, at = s.shared @ J.T, s.of(s.anchor)
         # It moves as the last poses did, so what it is off by relative to the anchor has to do with that one's error.
-        A = adjoint(inverse(T) @ s.poses[at])
-        P = A @ (s.spread[at] @ A.T + 2 * shared) + own
+        A = np.concatenate([adjoint(inverse(T) @ s.poses[at]), np.eye(6)], axis=1)
+        P = _carried(A, np.block([[s.spread[at], shared], [shared.T, own]]))
         return replace(
             s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread, 0.5 * (P + P.T)[None]]),
             pair=np.block([[s.own, cross.T], [cross, own]]), shared=np.concatenate([s.shared[:, 6:], shared], axis=1),
