@@ -171,7 +171,8 @@ class SmootherBackend:
     @property
     def revises_path(self) -> bool:
         """See `slam.interfaces.RevisingBackend`: True while the first pose has not left the lag."""
-        return self._graph.oldest(self.state) == 0
+        s = self.state
+        return not s.started or s.oldest(self.config.lag, s.number) == 0
 
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:

@@ -107,7 +107,7 @@ class Graph:
     def rebuilt(self, s: SmootherState, again: int = 0) -> Solved:
         """The solution with all anew, linearised `again` so many times more; SolverError where gtsam fails."""
         self.restart()
-        oldest, self._careful = self.oldest(s), max(self._careful, s.number + 1)
+        oldest, self._careful = s.oldest(self._lag, s.number), max(self._careful, s.number + 1)
         self._kind, self._first = _kind(s), s.poses[s.of(oldest)]
         prior, self._base = held(s, oldest)
         begin = GraphProblem()
@@ -119,14 +119,9 @@ class Graph:
         self._to_state, self._first = M @ self._to_state, M @ self._first
         self._poses = {number: M @ T for number, T in self._poses.items()}
 
-    def oldest(self, s: SmootherState) -> int:
-        """Number of the oldest pose in the graph, once it has the newest one of the state."""
-        least = max(s.begun, s.first)
-        return least if self._lag is None else max(least, s.number - self._lag)
-
     def _update(self, s: SmootherState, numbers: range, problem: GraphProblem, again: int = 0) -> Solved:
         """The solution after a problem, and some poses with what was measured from them; solved `again` so often."""
-        oldest, before = self.oldest(s), numbers.start - 1
+        oldest, before = s.oldest(self._lag, s.number), numbers.start - 1
         first = min(oldest, before) if self._poses else oldest  # more than a lag of poses may have seen nothing
         for number in numbers:
             if number > first:
@@ -138,7 +133,7 @@ class Graph:
         made = self._tracks.make_smart(problem, s.number < self._careful)
         # Two steps of Gauss and Newton: in the first, nothing leaves. What leaves fixes where its neighbours stay
         # linearised, and that is to be after the newest pose is solved for.
-        now: Stamps = dict.fromkeys(problem.values.keys(), float(before))
+        now: Stamps = dict.fromkeys(problem.values.keys(), float(s.ages[s.of(numbers.start)] - 1))
         with solving():
             self._solver.update(problem.factors, problem.values, now, problem.removed)
             slots = self._solver.getISAM2Result().getNewFactorsIndices()
@@ -148,7 +143,7 @@ class Graph:
             values = self._solver.calculateEstimate()
         for track, place in made:
             track.slot = slots[place]
-        self._tracks.forget(s)
+        self._tracks.forget(s, oldest)
         new = [i for i in numbers if i >= oldest] if self._poses else [s.number]
         poses = self._to_state @ [values.atPose3(pose_key(i)).matrix() for i in range(oldest, s.number + 1)]
         self._poses = dict(zip(range(oldest, s.number + 1), poses))
@@ -171,7 +166,7 @@ class Graph:
         """
         if not self._is_of(s):
             return last, s.spread[s.of(last)]
-        solved, begin = self.number, max(s.begun, s.first, self.number - (self._lag or self.number))
+        solved, begin = self.number, s.oldest(self._lag, self.number)
         begin, first = max(begin, min(first, solved - 1)), max(begin, first)
         P = self._joint(list(range(begin, solved + 1)))
         for number in range(solved + 1, last + 1):

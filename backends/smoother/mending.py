@@ -31,7 +31,7 @@ def corrected(s: SmootherState, correct: Callable[[Array], Array]) -> SmootherSt
 
 def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     """The last poses after a correction: the newest one stays where it is, the others and the landmarks move."""
-    first = graph.oldest(s)
+    first = s.oldest(steps.config.lag, s.number)
     now, spread, start = s.poses[s.of(first) :], s.spread, s.start
     with suppress(SolverError):  # then the next update tries again
         solved = graph.rebuilt(s, _AGAIN)

@@ -58,6 +58,7 @@ class SmootherState:
     stamps: Array  # their times (K,) [s]
     rests: BoolArray  # whether the camera rested since the pose before (K,)
     free: BoolArray  # whether it may have turned anyhow since the anchor before (K,): nothing was seen for long
+    ages: IndexArray  # how many poses up to each (K,) saw something: those in the dark take no part of the lag
     sights: tuple[Sight, ...]  # what was measured from each
     spread: Array  # covariance in the world of each when it was the newest that was solved for (K, 6, 6)
     pair: Array  # joint covariance (12, 12) of the errors of the last two poses relative to the anchor
@@ -80,8 +81,9 @@ class SmootherState:
     @classmethod
     def empty(cls, by_rig: Array) -> SmootherState:
         """Before the first prediction; `by_rig` (6, m) is of the first pose."""
+        no = np.zeros(0, bool)
         return cls(
-            0, 0, np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0, bool), np.zeros(0, bool), (), np.zeros((0, 6, 6)),
+            0, 0, np.zeros((0, 4, 4)), np.zeros(0), no, no, np.zeros(0, np.intp), (), np.zeros((0, 6, 6)),
             np.zeros((12, 12)), np.zeros((6, 12)), np.tile(by_rig, (2, 1)),
             landmarks=SmootherLandmarks.none(by_rig.shape[1]),
         )  # fmt: skip
@@ -121,12 +123,20 @@ class SmootherState:
         """Row of a pose."""
         return number - self.first
 
+    def oldest(self, lag: int | None, newest: int) -> int:
+        """Number of the oldest pose in the graph, once it has the newest one of such a number."""
+        least = max(self.begun, self.first)
+        if lag is None:
+            return least
+        return max(least, self.first + int(np.searchsorted(self.ages, self.ages[self.of(newest)] - lag)))
+
     def without_old(self, past: int, lag: int) -> SmootherState:
-        """Without what is kept of all but the last `past` poses, of which `lag` are smoothed."""
-        gone = len(self.poses) - past
+        """Without what is kept of all but the last `past` poses before those that are smoothed."""
+        oldest = self.oldest(lag, self.number)
+        gone = max(self.of(oldest) - past, 0)
         return replace(
             self, first=self.first + gone, poses=self.poses[gone:], stamps=self.stamps[gone:], rests=self.rests[gone:],
-            free=self.free[gone:], sights=self.sights[gone:], spread=self.spread[gone:],
-            landmarks=self.landmarks.folded(self.first + gone, self.number - lag),
+            free=self.free[gone:], ages=self.ages[gone:], sights=self.sights[gone:], spread=self.spread[gone:],
+            landmarks=self.landmarks.folded(self.first + gone, oldest),
             known={k: one for k, one in self.known.items() if not 0 <= one.pose < self.first + gone},
         )  # fmt: skip

@@ -49,8 +49,8 @@ class Steps(RectifiedMeasurement):
             T = self.models.initial_pose
             sigmas = np.repeat([self.models.initial_rotation_sigma, self.models.initial_position_sigma], 3)
             P: Array = np.diag(sigmas**2)
-            return _begun(replace(s, poses=T[None], spread=P[None]), T, P)
-        s = replace(s, poses=np.concatenate([s.poses, s.poses[-1:]]))
+            return _begun(replace(s, poses=T[None], spread=P[None], ages=np.zeros(1, np.intp)), T, P)
+        s = replace(s, poses=np.concatenate([s.poses, s.poses[-1:]]), ages=np.append(s.ages, s.ages[-1]))
         T, J, noise, _ = s.moved(self.models, s.number)
         cross = J @ s.pair[:, 6:]
         own = _carried(J, s.pair) + noise
@@ -119,7 +119,7 @@ class Steps(RectifiedMeasurement):
         seen, number = rows[used], s.number
         if found.jump is not None:
             marks = marks.without_measurements(np.ones(len(marks), bool)).measured(seen, z[used], number, self.track)
-            after = replace(s, sights=(*s.sights[:-1], Sight.of(marks, seen, z[used])))
+            after = replace(_seeing(s), sights=(*s.sights[:-1], Sight.of(marks, seen, z[used])))
             after = _begun(after, found.T, world_covariance(s.spread[-1]))
             known = {serial: one for serial, one in s.known.items() if one.pose < 0}
             after = replace(after, known=known, landmarks=marks)
@@ -135,13 +135,13 @@ class Steps(RectifiedMeasurement):
         marks.by_rig[seen] = _landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
         linear = math.sqrt(self.stereo.f / self.models.pixel_sigma)
         marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T, linear)
-        marks = marks.measured(seen, z[used], number, self.track, graph.oldest(s), graph.number)
+        marks = marks.measured(seen, z[used], number, self.track, s.oldest(self.config.lag, number), graph.number)
         before_by_rig = s.by_rig[:6]
         if number > s.begun:
             before_by_rig = before_by_rig + s.pair[:6, 6:] @ np.linalg.solve(s.own, by_rig - s.by_rig[6:])
         after = replace(
-            s, sights=(*s.sights[:-1], Sight.of(marks, seen, z[used])), landmarks=marks,
-            poses=np.concatenate([s.poses[:-1], found.T[None]]), free=np.append(s.free[:-1], unknown_turn(s.own)),
+            _seeing(s), sights=(*s.sights[:-1], Sight.of(marks, seen, z[used])), landmarks=marks,
+            poses=np.concatenate([s.poses[:-1], found.T[None]]),
             by_rig=np.concatenate([before_by_rig, by_rig]),
         )  # fmt: skip
         solved, why = graph.followed(after)
@@ -166,8 +166,8 @@ class Steps(RectifiedMeasurement):
             known={**s.known, **used} if used else s.known,
         )  # fmt: skip
         lag = self.config.lag
-        kept = len(s.poses) if lag is None else lag + 1 + self.config.past
-        return s if lag is None or len(s.poses) < 1.5 * kept else s.without_old(kept, lag)
+        grown = lag is not None and len(s.poses) >= 1.5 * (lag + 1 + self.config.past)
+        return s.without_old(self.config.past, lag) if lag is not None and grown else s
 
     # --- landmarks ---
 
@@ -223,7 +223,7 @@ def _begun(s: SmootherState, T: Array, P: Array) -> SmootherState:
     poses, spread = np.concatenate([s.poses[:-1], T[None]]), np.concatenate([s.spread[:-1], P[None]])
     return replace(
         s, begun=s.number, poses=poses, spread=spread, pair=pair, shared=shared, prior=P, start=T,
-        turned=T[:3, :3] @ P[:3, :3] @ T[:3, :3].T, anchor=s.number,
+        turned=T[:3, :3] @ P[:3, :3] @ T[:3, :3].T, anchor=s.number, free=np.append(s.free[:-1], False),
     )  # fmt: skip
 
 
@@ -236,8 +236,13 @@ def _anchored(s: SmootherState) -> SmootherState:
     A, B = (adjoint(inverse(T) @ one) for T, one in ((s.poses[-1], at), (s.poses[-2], s.poses[-1])))
     shared[:, :6] += A @ (s.shared[:, :6] - s.shared[:, 6:] @ B.T)
     marks = s.landmarks.left_behind(np.zeros(0, np.intp), s.poses[-1], s.own)
-    free = np.append(s.free[:-1], unknown_turn(s.own))
-    return replace(s, pair=pair, shared=shared, anchor=s.number, landmarks=marks, free=free)
+    return replace(_seeing(s), pair=pair, shared=shared, anchor=s.number, landmarks=marks)
+
+
+def _seeing(s: SmootherState) -> SmootherState:
+    """With the newest pose as one that saw something."""
+    free, last = unknown_turn(s.own), int(s.ages[-2:][0])
+    return replace(s, free=np.append(s.free[:-1], free), ages=np.append(s.ages[:-1], last + 1))
 
 
 def _before(P: Array, poses: Array) -> tuple[Array, Array]:
