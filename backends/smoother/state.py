@@ -57,7 +57,6 @@ class SmootherState:
     poses: Array  # T_world_left (K, 4, 4)
     stamps: Array  # their times (K,) [s]
     rests: BoolArray  # whether the camera rested since the pose before (K,)
-    free: BoolArray  # whether it may have turned anyhow since the anchor before (K,): nothing was seen for long
     ages: IndexArray  # how many poses up to each (K,) saw something: those in the dark take no part of the lag
     sights: tuple[Sight, ...]  # what was measured from each
     spread: Array  # covariance in the world of each when it was the newest that was solved for (K, 6, 6)
@@ -81,9 +80,8 @@ class SmootherState:
     @classmethod
     def empty(cls, by_rig: Array) -> SmootherState:
         """Before the first prediction; `by_rig` (6, m) is of the first pose."""
-        no = np.zeros(0, bool)
         return cls(
-            0, 0, np.zeros((0, 4, 4)), np.zeros(0), no, no, np.zeros(0, np.intp), (), np.zeros((0, 6, 6)),
+            0, 0, np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0, bool), np.zeros(0, np.intp), (), np.zeros((0, 6, 6)),
             np.zeros((12, 12)), np.zeros((6, 12)), np.tile(by_rig, (2, 1)),
             landmarks=SmootherLandmarks.none(by_rig.shape[1]),
         )  # fmt: skip
@@ -136,7 +134,7 @@ class SmootherState:
         gone = max(self.of(oldest) - past, 0)
         return replace(
             self, first=self.first + gone, poses=self.poses[gone:], stamps=self.stamps[gone:], rests=self.rests[gone:],
-            free=self.free[gone:], ages=self.ages[gone:], sights=self.sights[gone:], spread=self.spread[gone:],
+            ages=self.ages[gone:], sights=self.sights[gone:], spread=self.spread[gone:],
             landmarks=self.landmarks.folded(self.first + gone, oldest),
             known={k: one for k, one in self.known.items() if not 0 <= one.pose < self.first + gone},
         )  # fmt: skip

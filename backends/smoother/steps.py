@@ -42,7 +42,7 @@ class Steps(RectifiedMeasurement):
     def predicted(self, s: SmootherState, stamp: float, rests: bool = False) -> SmootherState:
         """With the newest frame at `stamp` [s], by the motion model."""
         s = replace(
-            s, stamps=np.append(s.stamps, stamp), rests=np.append(s.rests, rests), free=np.append(s.free, False),
+            s, stamps=np.append(s.stamps, stamp), rests=np.append(s.rests, rests),
             sights=(*s.sights, Sight.none()), measured=False,
         )  # fmt: skip
         if not s.started:
@@ -118,12 +118,7 @@ class Steps(RectifiedMeasurement):
         used, marks = found.used, s.landmarks
         seen, number = rows[used], s.number
         if found.jump is not None:
-            marks = marks.without_measurements(np.ones(len(marks), bool)).measured(seen, z[used], number, self.track)
-            after = replace(_seeing(s), sights=(*s.sights[:-1], Sight.of(marks, seen, z[used])))
-            after = _begun(after, found.T, world_covariance(s.spread[-1]))
-            known = {serial: one for serial, one in s.known.items() if one.pose < 0}
-            after = replace(after, known=known, landmarks=marks)
-            return self.settled(after, graph.rebuilt(after)), float("nan"), ""
+            return self._anew(s, graph, found.T, world_covariance(s.spread[-1]), seen, z[used])
         one = replace(one, points=one.points[used], z=z[used], noise=one.noise[used])
         field, before = self.field(one.z), marks.by_rig[seen]
         G, F = _by_pose_and_rig(one, found.T, before, field)
@@ -133,6 +128,12 @@ class Steps(RectifiedMeasurement):
         marks = replace(marks, by_rig=marks.by_rig.copy())
         own = marks.from_newest[seen]
         marks.by_rig[seen] = _landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
+        if unknown_turn(s.own):
+            P = np.linalg.inv(one.information + G.T @ G)
+            at = s.of(s.anchor)
+            A = adjoint(inverse(found.T) @ s.poses[at])
+            P = world_covariance(s.spread[-1]) if marks.world[seen].any() else A @ s.spread[at] @ A.T + P
+            return self._anew(s, graph, found.T, P, seen, z[used])
         linear = math.sqrt(self.stereo.f / self.models.pixel_sigma)
         marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T, linear)
         marks = marks.measured(seen, z[used], number, self.track, s.oldest(self.config.lag, number), graph.number)
@@ -149,6 +150,15 @@ class Steps(RectifiedMeasurement):
         after = self.settled(after, solved)
         marks = after.landmarks.without_variables(number) if why else after.landmarks
         return replace(after, landmarks=marks.left_behind(seen, after.poses[-1], drift)), nis, why
+
+    def _anew(
+        self, s: SmootherState, graph: Graph, T: Array, P: Array, seen: IndexArray, z: Array
+    ) -> tuple[SmootherState, float, str]:
+        """As `_corrected`, with the newest pose, at T (4, 4) with a covariance P (6, 6), as the first of a problem."""
+        s = _begun(_seeing(s), T, P)
+        marks = s.landmarks.measured(seen, z, s.number, self.track)
+        s = replace(s, sights=(*s.sights[:-1], Sight.of(marks, seen, z)), landmarks=marks)
+        return self.settled(s, graph.rebuilt(s)), float("nan"), ""
 
     def settled(self, s: SmootherState, solved: Solved) -> SmootherState:
         """The state with what the graph says: the newest pose is the anchor."""
@@ -218,31 +228,39 @@ class Steps(RectifiedMeasurement):
 
 
 def _begun(s: SmootherState, T: Array, P: Array) -> SmootherState:
-    """With the newest pose, at T (4, 4) with a covariance P (6, 6), as the one with which the problem begins (anew)."""
+    """With the newest pose, at T (4, 4) with a covariance P (6, 6), as the one with which the problem begins (anew).
+
+    Landmarks go on as they stand; what they were measured from is no part of it.
+    """
     pair, shared = _ALONE
-    poses, spread = np.concatenate([s.poses[:-1], T[None]]), np.concatenate([s.spread[:-1], P[None]])
     return replace(
-        s, begun=s.number, poses=poses, spread=spread, pair=pair, shared=shared, prior=P, start=T,
-        turned=T[:3, :3] @ P[:3, :3] @ T[:3, :3].T, anchor=s.number, free=np.append(s.free[:-1], False),
+        s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread[:-1], P[None]]),
+        pair=pair, shared=shared, prior=P, start=T, turned=T[:3, :3] @ P[:3, :3] @ T[:3, :3].T,
+        begun=s.number, anchor=s.number, landmarks=s.landmarks.without_measurements(np.ones(len(s.landmarks), bool)),
+        known={serial: one for serial, one in s.known.items() if one.pose < 0},
     )  # fmt: skip
 
 
 def _anchored(s: SmootherState) -> SmootherState:
-    """With the newest pose as the anchor, where it is predicted if nothing was measured."""
+    """With the newest pose as the anchor, where it is predicted if nothing was measured.
+
+    Where it may have turned anyhow since, no linearisation holds: the problem begins anew.
+    """
     if s.anchor == s.number:
         return s
+    s = replace(_seeing(s), landmarks=s.landmarks.left_behind(np.zeros(0, np.intp), s.poses[-1], s.own))
+    if unknown_turn(s.own):
+        return _begun(s, s.poses[-1], s.spread[-1])
     pair, shared = _before(np.roll(s.pair, 6, (0, 1)), s.poses[-2:])
     at = s.poses[s.of(s.anchor)]
     A, B = (adjoint(inverse(T) @ one) for T, one in ((s.poses[-1], at), (s.poses[-2], s.poses[-1])))
     shared[:, :6] += A @ (s.shared[:, :6] - s.shared[:, 6:] @ B.T)
-    marks = s.landmarks.left_behind(np.zeros(0, np.intp), s.poses[-1], s.own)
-    return replace(_seeing(s), pair=pair, shared=shared, anchor=s.number, landmarks=marks)
+    return replace(s, pair=pair, shared=shared, anchor=s.number)
 
 
 def _seeing(s: SmootherState) -> SmootherState:
     """With the newest pose as one that saw something."""
-    free, last = unknown_turn(s.own), int(s.ages[-2:][0])
-    return replace(s, free=np.append(s.free[:-1], free), ages=np.append(s.ages[:-1], last + 1))
+    return replace(s, ages=np.append(s.ages[:-1], s.ages[-2:][0] + 1))
 
 
 def _before(P: Array, poses: Array) -> tuple[Array, Array]:

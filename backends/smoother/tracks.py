@@ -79,12 +79,12 @@ class Tracks:
     def _motion(self, s: SmootherState, number: int, first: int) -> gtsam.NonlinearFactor:
         """What the motion model says of a pose: its velocity is that between the two poses before, but for noise.
 
-        Where the graph has but one of these two, or the motion is unknown, the pose is hardly held where it is.
+        Where the graph has but one of these two, the pose is hardly held where it is.
         """
         row, (dt, before) = s.of(number), s.intervals(number)
         if s.rests[row]:
             return self._make.tie(number - 1, number, np.eye(4), STANDS)
-        if s.free[row - 1 : row + 1].any() or (not is_first(before, dt) and number - 2 < first):
+        if not is_first(before, dt) and number - 2 < first:
             return self._make.tie(number - 1, number, inverse(s.poses[row - 1]) @ s.poses[row], _LOOSE)
         count = 2 if is_first(before, dt) else 3
         keys = [pose_key(i) for i in range(number + 1 - count, number + 1)]
