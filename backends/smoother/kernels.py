@@ -118,7 +118,9 @@ def carried_by(camera, poses, width, frames, z, sigma, points, older, own):
                 place = max(frames[m, k] - first, 0)
                 oldest = min(oldest, place)
                 add_information(camera, poses[frames[m, k]], z[m, k], points[m], weight, share[place], g, work)
-        share[oldest] += older[m]
+        for i in range(3):
+            for j in range(3):
+                share[oldest, i, j] += older[m, i, j]
         for w in range(width):
             T = poses[first + w]
             multiply(own[m], share[w], C)
