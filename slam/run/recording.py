@@ -28,7 +28,7 @@ from slam.files import json_text, read_bytes, unpack, whole_file
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.geometry.trajectory import Trajectory
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.models import EstimatorModels, MotionModel, ObjectModels, SlideModel, models_for
 
 _HEADER = {"format": "surf-stereo-slam recording", "version": 3}
@@ -55,6 +55,7 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         pixels.append(np.full((gone, 4), np.nan))
     rig = {"left": asdict(r.rig.left), "right": asdict(r.rig.right), "R": r.rig.R.tolist(), "b": r.rig.b.tolist()}
     header = _HEADER | {"name": r.name, "kind": r.kind, "rig": rig, "models": asdict(r.models)}
+    header["truth_noise"] = asdict(r.truth_noise)
     arrays: dict[str, Any] = {"header": json.dumps(header), "numbers": np.array([f.number for f in r], np.int64)}
     arrays |= {"stamps": r.stamps, "rows": np.concatenate(rows), "pixels": np.concatenate(pixels)}
     revisions = [frame.revision for frame in r]
@@ -109,7 +110,8 @@ def _recording(arrays: dict[str, np.ndarray]) -> Recording:
         raise SequenceError("its name is no text")
     truth = Trajectory(arrays["truth_stamps"], arrays["truth_poses"]) if "truth_stamps" in arrays else None
     frames = _frames(arrays, rig)
-    return Recording(header["name"], rig, EstimatorModels(**models), frames, truth, kind=header["kind"])
+    noise = TruthNoise(**header.get("truth_noise", {}))
+    return Recording(header["name"], rig, EstimatorModels(**models), frames, truth, noise, kind=header["kind"])
 
 
 def _frames(arrays: Mapping[str, np.ndarray], rig: StereoRig) -> tuple[RecordedFrame, ...]:
@@ -183,6 +185,7 @@ class Recording:
         models: noise, priors and motion that the run assumed.
         frames: what was given, frame by frame; their stamps increase.
         ground_truth: the left camera's true path, where it is known.
+        truth_noise: how far it may be off.
         kind: of motion, which chooses a back end's default options.
 
     Raises:
@@ -195,6 +198,7 @@ class Recording:
     models: EstimatorModels
     frames: tuple[RecordedFrame, ...]
     ground_truth: Trajectory | None = None
+    truth_noise: TruthNoise = field(default_factory=TruthNoise)
     warnings: list[str] = field(default_factory=list)
     kind: str = "handheld"
 
