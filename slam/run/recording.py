@@ -24,7 +24,7 @@ from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.checks import LATEST_STAMP, MOST_ID
 from slam.data import FrameResult, IdArray, Observations
 from slam.errors import MeasurementError, SequenceError, SlamError
-from slam.files import array, json_text, read_bytes, unpack, whole_file
+from slam.files import json_text, read_bytes, unpack, whole_file
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
@@ -79,8 +79,7 @@ def load_recording(path: str | Path) -> Recording:
     content = read_bytes(path, _LARGEST, expected="a recording, which `slam run --record FILE.npz` leaves")
     if content.startswith(b"surf-stereo-slam map"):
         raise SequenceError(f"{path}: a saved map, which a run starts in with --map, no recording")
-    members = unpack(content, str(path), SequenceError)
-    arrays = {name.removesuffix(".npy"): array(data, name, str(path), SequenceError) for name, data in members.items()}
+    arrays = unpack(content, str(path), error=SequenceError)
     try:
         return _recording(arrays)
     except KeyError as error:
