@@ -26,6 +26,7 @@ _EXPLAINS = 2.5  # times smaller errors become by a mistake that is named
 _LATEST, _STEP = 2.0, 0.05  # [s] of the shifts that are tried
 _FINE = 0.01  # errors of motions, as a share of them, below which nothing is looked for
 _MISFIT = 0.3  # errors of motions, as a share of them, that are no drift
+_APART = 0.8  # the same, that no noise of an estimated path explains
 _ALIKE = 0.05  # errors of positions, as a share of the path, that are drift
 _ROUNDS = 8  # of the fit
 _LEVER_PRIOR = 1e-4  # [rad²] of turns that tell no lever
@@ -105,7 +106,7 @@ def _unexplained(own: Trajectory, truth: Trajectory, error: float) -> tuple[str,
     """What to say where no mistake explains why motions differ: of rotations alone, where positions agree."""
     pairs = associate(own, truth)
     extent = float(np.sqrt(3 * pairs[1].positions.var(axis=0).mean()))
-    if error < _MISFIT or absolute_errors(*pairs).rmse > _ALIKE * extent:
+    if error < _APART or absolute_errors(*pairs).rmse > _ALIKE * extent:
         return "", False
     return (
         "the true path looks wrong: its positions agree with the estimated path, its rotations do not: are they the "

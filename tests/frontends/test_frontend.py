@@ -122,7 +122,12 @@ def test_threshold_keeps_the_number_of_features():
     [
         (LEFT, RIGHT[:, :100], "frame 7, right image: 100x240 pixels"),
         (None, RIGHT, "frame 7, left image: is None and no array"),
-        (LEFT.astype(float), RIGHT, "frame 7, left image: pixels must be uint8 or uint16, not float64"),
+        (
+            LEFT.astype(float),
+            RIGHT,
+            r"frame 7, left image: pixels must be uint8 or uint16, not float64; give image\.astype",
+        ),
+        (LEFT / 255, RIGHT, r"not float64; give \(255 \* image\)\.astype"),
     ],
 )
 def test_unusable_images(left, right, says):

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from slam.config import SystemConfig
-from slam.geometry.trajectory import TruthNoise
+from slam.errors import SlamError
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.run.options import RunOptions
+from slam.run.plots import drawn
 from slam.run.plots import plot_folders as plot_runs
 from slam.run.run_data import RunData, pose_errors
 from slam.run.runner import run
@@ -31,6 +33,26 @@ def test_a_path_that_is_one_dot_is_drawn_without_a_word(tmp_path, caplog):
     caplog.clear()
     plot_runs([tmp_path / "a"], tmp_path / "a.png", "summary")
     assert not caplog.messages
+
+
+def test_the_folder_above_finished_runs_names_them(runs):
+    with pytest.raises(SlamError, match=f"below it are some: {runs / 'a'} {runs / 'b'}"):
+        plot_runs([runs], None, "summary")
+
+
+def test_runs_with_different_true_paths_and_a_lost_one_say_so(runs):
+    first, second = (RunData.read(runs / name, name) for name in "ab")
+    other = replace(second, truth=Trajectory(second.truth.stamps, 2.0 * second.truth.poses))
+    for pair, words in (((first, second), "true path"), ((first, other), "true path of a; others have another")):
+        assert words in [line.get_label() for line in drawn(pair, "path").axes[0].lines]
+    lost = replace(first, measured=np.arange(len(first.measured)) == 0)
+    assert drawn([lost], "path").axes[0].get_title().startswith("No path")
+    stands = replace(first, truth=None, **dict.fromkeys(("online", "final"), still(first.online)))
+    assert drawn([stands], "path").axes[0].get_title().startswith("The camera stands")
+
+
+def still(path):
+    return Trajectory(path.stamps, np.tile(np.eye(4), (len(path), 1, 1)))
 
 
 def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(runs):

@@ -86,3 +86,12 @@ def test_figures_of_bodies_are_means_over_those_that_were_in_view():
     assert found["body_coverage"] == pytest.approx(0.6) and found["body_nees_per_dof"] == pytest.approx(2.0)
     assert found["moving_precision"] == 0.5
     assert "moving_precision" not in figures(summary(1.0) | {"objects": {"features": {"precision": 0.5}, "bodies": {}}})
+
+
+def test_a_truth_that_is_given_is_said_to_count_as_exact_and_a_wrong_one_judges_nothing():
+    given = summary(1.0) | {"format": "folders", "truth": {"rotation": 0.0, "translation": 0.0}}
+    assert verdict_of_run(given).endswith("; the true path is taken as exact")
+    for known in (given | {"format": "synthetic"}, given | {"truth": {"rotation": 0.0, "translation": 1e-3}}):
+        assert "exact" not in verdict_of_run(known)
+    wrong = given | {"consistency": {}, "truth_doubt": "it is in mm"}
+    assert verdict_of_run(wrong).startswith("covariances are not judged: the true path looks wrong")

@@ -73,6 +73,26 @@ def test_a_path_that_lacks_frames_is_said(caplog):
     record.milliseconds = [{}] * N
     results_of(SEQUENCE, SimpleNamespace(), record, path.select(np.arange(N - 3)), None)
     assert "trajectory() lacks 3 of 120 frames" in caplog.text and "singular" not in caplog.text
+    far = Trajectory(path.stamps, np.linalg.inv(path.poses))
+    results_of(SEQUENCE, SimpleNamespace(), record, far, None)
+    assert "estimate() and trajectory() are 47.6 m apart" in caplog.text
     record.covariances = [np.zeros((6, 6))] * N
     results_of(SEQUENCE, SimpleNamespace(), record, path, None)
     assert "singular covariance for 119 of 120 poses" in caplog.text
+
+
+def test_truth_that_begins_after_the_first_image_is_judged_from_there_and_a_wrong_one_not_at_all(caplog):
+    record = RunRecord(milliseconds=[{}] * N, measured=[True] * N, common=[CommonError()] * N)
+    steps = np.array([exp(0.1 * SIGMA * step) for step in np.random.default_rng(0).standard_normal((N, 6))])
+    poses = [np.eye(4)]
+    for k in range(1, N):
+        poses.append(poses[-1] @ exp(np.array([0, 0, 0, 0, 0, 0.2])) @ steps[k])
+    record.stamps, record.poses = TRUTH.stamps.tolist(), poses
+    record.covariances = [(0.1 * SIGMA) ** 2 * k * np.eye(6) for k in range(N)]
+    late = SimpleNamespace(format="folder", ground_truth=TRUTH.select(np.arange(20, N)), truth_noise=TruthNoise())
+    final = Trajectory(TRUTH.stamps, np.array(poses))
+    found = results_of(late, SimpleNamespace(), record, final, None)
+    assert "mean NEES" in found["consistency"] and found["consistency"]["poses before the truth"] == 20
+    late.ground_truth.poses[:, :3, 3] *= 1000.0
+    found = results_of(late, SimpleNamespace(), record, final, None)
+    assert "is it in mm?" in found["truth_doubt"] == caplog.messages[-1] and "mean NEES" not in found["consistency"]
