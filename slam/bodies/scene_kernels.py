@@ -131,70 +131,81 @@ def _solve(factor, right, out):
     solve_factorised(factor, 6, out)
 
 
-@helper
-def _times(triangle, v, out):
-    """The product of a triangle's matrix, with the prior on its diagonal, and a vector (6,)."""
-    for i in range(6):
-        out[i] = PRIOR[i] * v[i]
-    k = 0
-    for i in range(6):
-        for j in range(i):
-            out[i] += triangle[k] * v[j]
-            out[j] += triangle[k] * v[i]
-            k += 1
-        out[i] += triangle[k] * v[i]
-        k += 1
-
-
 # ---------------------------------------------------------------------------------------------- groups
 
 
 @helper
-def _window_tests(starts, tracks, L, eta, alone, scale, rest, asked, support, largest, clear):
-    """By how much the χ²(6) of every window exceeds what is asked, into `clear` (M,); −∞ where there is no test.
+def _gain(triangle, gradient, factor, work):
+    """By how much a triangle's tracks fit better with a motion of their own, from the gradient (6,) at another."""
+    _factorise(triangle, 1.0, factor)
+    _solve(factor, gradient, work)
+    total = 0.0
+    for i in range(6):
+        total += gradient[i] * work[i]
+    return total
 
-    The test is whether the motion of the tracks inside is that of the rest; `asked` (N + 1,) is by their number.
+
+@helper
+def _window_tests(starts, tracks, L, eta, dWd, alone, scale, rest, asked, support, largest, clear):
+    """By how much the χ²(6) of every window exceeds what is asked, into `clear` (M,); −∞ where it does not.
+
+    The test is whether the motion of the tracks inside is that of the rest; `asked` (N + 1,) is by their number. It is
+    what the tracks inside and those outside gain by motions of their own, beside the motion ξ that both share: ``gᵀ
+    (Λ_w⁻¹ + Λ_r⁻¹) g`` with the gradient ``g = Λ_w ξ − η_w``. The first gain is at most their χ² against ξ. With a
+    share of at most ``ρ = tr(Λ⁻¹ Λ_w)`` of the information along any motion, the sum is at most the first over 1 − ρ;
+    most windows need no more than these sums.
     """
-    total, told = np.zeros(21), np.zeros(6)
-    for n in range(len(alone)):
-        if rest[n]:
-            weight = min(1.0, _PULL / max(alone[n], 1e-9)) / scale
-            _add_weighted(total, L[n], weight)
-            _add_weighted(told, eta[n], weight)
-    both, own, other = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
-    _factorise(total, 2.0, both)
-    inside, told_inside, outside, told_outside = np.empty(21), np.empty(6), np.empty(21), np.empty(6)
-    gap, motion, left, right = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
-    for m in range(len(clear)):
-        clear[m] = -np.inf
-        own_tracks = tracks[starts[m] : starts[m + 1]]
-        size = 0
-        for n in own_tracks:
-            size += rest[n]
-        if size < support or size > largest:
+    n = len(alone)
+    total, told, weight, off, hold = np.zeros(21), np.zeros(6), np.zeros(n), np.empty(n), np.empty(n)
+    for m in range(n):
+        if rest[m]:
+            weight[m] = min(1.0, _PULL / max(alone[m], 1e-9)) / scale
+            _add_weighted(total, L[m], weight[m])
+            _add_weighted(told, eta[m], weight[m])
+    factor, motion, products, shares = np.empty((6, 6)), np.empty(6), np.empty(21), np.empty(21)
+    inside, outside, gradient, column, unit = np.empty(21), np.empty(21), np.empty(6), np.empty(6), np.zeros(6)
+    _factorise(total, 2.0, factor)
+    _solve(factor, told, motion)
+    _products(motion, products)
+    prior_off = prior_hold = 0.0
+    for i in range(6):
+        unit[:] = 0.0
+        unit[i] = 1.0
+        _solve(factor, unit, column)
+        prior_off += PRIOR[i] * motion[i] ** 2
+        prior_hold += PRIOR[i] * column[i]
+        for j in range(i + 1):
+            shares[i * (i + 1) // 2 + j] = (1.0 if i == j else 2.0) * column[j]
+    for m in range(n):
+        off[m] = weight[m] * _square(L[m], eta[m], dWd[m], motion, products)
+        hold[m] = 0.0
+        for k in range(21):
+            hold[m] += weight[m] * L[m, k] * shares[k]
+    for w in range(len(clear)):
+        clear[w] = -np.inf
+        own = tracks[starts[w] : starts[w + 1]]
+        size, most, share = 0, prior_off, prior_hold
+        for m in own:
+            if rest[m]:
+                size, most, share = size + 1, most + off[m], share + hold[m]
+        if size < support or size > largest or most <= asked[size] * (1.0 - share):
             continue
-        inside[:], told_inside[:] = 0.0, 0.0
-        for n in own_tracks:
-            if rest[n]:
-                weight = min(1.0, _PULL / max(alone[n], 1e-9)) / scale
-                _add_weighted(inside, L[n], weight)
-                _add_weighted(told_inside, eta[n], weight)
+        inside[:], gradient[:] = 0.0, 0.0
+        for m in own:
+            _add_weighted(inside, L[m], weight[m])
+            _add_weighted(gradient, eta[m], -weight[m])
+        for i in range(6):
+            gradient[i] += PRIOR[i] * motion[i]
+            for j in range(6):
+                gradient[i] += inside[max(i, j) * (max(i, j) + 1) // 2 + min(i, j)] * motion[j]
+        value = _gain(inside, gradient, factor, column)
+        if value <= asked[size] * (1.0 - share):
+            continue
         for k in range(21):  # expressions of arrays take seconds to compile
             outside[k] = total[k] - inside[k]
-        for i in range(6):
-            told_outside[i] = told[i] - told_inside[i]
-        _factorise(inside, 1.0, own)
-        _factorise(outside, 1.0, other)
-        _solve(own, told_inside, gap)
-        _solve(other, told_outside, motion)
-        for i in range(6):
-            gap[i] -= motion[i]
-        _times(inside, gap, left)
-        _times(outside, gap, right)
-        _solve(both, right, motion)
-        clear[m] = -asked[size]
-        for i in range(6):
-            clear[m] += left[i] * motion[i]
+        value += _gain(outside, gradient, factor, column) - asked[size]
+        if value > 0.0:
+            clear[w] = value
 
 
 @kernel
@@ -222,7 +233,7 @@ def groups_apart(L, eta, dWd, place, starts, tracks, centres, widths, asked, sup
             doubted[m] = not rest[m]
         if 3 * left < n or len(clear) == 0:
             break
-        _window_tests(starts, tracks, L, eta, alone, scale, rest, asked, support, LARGEST * left, clear)
+        _window_tests(starts, tracks, L, eta, dWd, alone, scale, rest, asked, support, LARGEST * left, clear)
         found = 0
         for _ in range(_MOST):
             window = np.argmax(clear)
