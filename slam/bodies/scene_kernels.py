@@ -22,6 +22,7 @@ _EXPLAINED = 0.25  # share of χ² that the common motion may leave: an uneven m
 _BETTER = 4.0  # by how much χ² a member must fit its group's motion better than the rest's, and
 _BETTER_AROUND = 6.0  # where it lies outside the window
 _AROUND = 1.0  # how far beyond its window a group's tracks are looked for, in widths of the window
+_CELLS = 2**12  # numerics: more than there are windows along an axis
 _MOST = 20  # cost: windows looked into for the next group
 MEDIAN = chi_square_limit(3, 0.5)  #: of χ²(3)
 
@@ -132,6 +133,64 @@ def _solve(factor, right, out):
 
 
 # ---------------------------------------------------------------------------------------------- groups
+
+
+@kernel
+def window_codes(place, sizes):
+    """A number for every window that a track at `place` (N, 3) is in, and the track itself in its last digits.
+
+    Windows have `sizes` (S, 3), and each is half a width from the next along every axis: eight overlap. Sorted (8 S N,)
+    numbers have each window's tracks in a row.
+    """
+    n = len(place)
+    codes = np.empty(8 * len(sizes) * n, np.int64)
+    k = 0
+    for kind in range(8 * len(sizes)):
+        for m in range(n):
+            code = kind
+            for axis in range(3):
+                cell = np.floor(place[m, axis] / sizes[kind // 8, axis] + _shift(kind, axis))
+                code = code * _CELLS + min(max(int(cell) + _CELLS // 2, 0), _CELLS - 1)
+            codes[k] = code * n + m
+            k += 1
+    return codes
+
+
+@helper
+def _shift(kind, axis):
+    """By which part of a width windows of a kind are shifted along an axis: the kind's last binary digits say where."""
+    return 0.5 * (kind >> (2 - axis) & 1)
+
+
+@kernel
+def full_windows(codes, n, sizes, least):
+    """Windows with at least so many of n tracks, by the sorted `window_codes`.
+
+    As starts (M + 1,) of the windows in the list of their tracks, that list, and centres and widths (M, 3).
+    """
+    most = len(codes) // least + 1
+    starts, tracks = np.empty(most + 1, np.int64), np.empty(len(codes), np.int64)
+    centres, widths = np.empty((most, 3)), np.empty((most, 3))
+    windows = size = first = 0
+    starts[0] = 0
+    for k in range(len(codes)):
+        code = codes[k] // n
+        if k + 1 < len(codes) and codes[k + 1] // n == code:
+            continue
+        if k + 1 - first >= least:
+            for i in range(first, k + 1):
+                tracks[size] = codes[i] - code * n
+                size += 1
+            kind = code // _CELLS**3
+            for axis in range(2, -1, -1):
+                widths[windows, axis] = sizes[kind // 8, axis]
+                cell = code % _CELLS - _CELLS // 2
+                centres[windows, axis] = (cell + 0.5 - _shift(kind, axis)) * widths[windows, axis]
+                code //= _CELLS
+            windows += 1
+            starts[windows] = size
+        first = k + 1
+    return starts[: windows + 1], tracks[:size], centres[:windows], widths[:windows]
 
 
 @helper
