@@ -101,7 +101,9 @@ def open_sequence(path: str | Path, format: str | None = None, quiet: bool = Fal
     if scheme is not None and format not in (None, scheme):
         raise ConfigurationError(f"{text}: format {format!r} does not go with a {scheme}: path")
     if "synthetic" in (scheme, format):
-        return _open_world(text.removeprefix("synthetic:"))
+        from slam.worlds import open_world
+
+        return open_world(text.removeprefix("synthetic:"), lambda names, rig: read_masks(names, Path.cwd(), rig))
     if "camera" in (scheme, format):
         from slam.sequences.camera import open_camera
 
@@ -177,12 +179,6 @@ def _own(name: str, folder: Path, options: Options, faults: FaultLog) -> Recorde
             f"format {name!r}: must return a slam.sequences.RecordedSequence, got {type(found).__name__}"
         )
     return found
-
-
-def _open_world(text: str) -> Sequence:
-    from slam.worlds import open_world
-
-    return open_world(text, lambda names, rig: read_masks(names, Path.cwd(), rig))
 
 
 def with_mask(text: str, mask: str | None) -> str:
