@@ -20,6 +20,7 @@ from slam.errors import ConfigurationError, SlamError
 from slam.files import noting_inputs, whole_file
 from slam.geometry.se3 import Array, inverse, transform
 from slam.geometry.stamps import pair
+from slam.geometry.trajectory import TruthNoise
 from slam.naming import unknown
 from slam.outputs import Output, require_outputs
 from slam.run.results import facts, number
@@ -344,9 +345,10 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
         end = max(float(np.ptp(run.online.stamps)) for run in runs)  # also where the truth begins later
         axis.set_xlim(-0.01 * end, 1.01 * end or 1.0)
     axes[0].tick_params(labelbottom=False)
-    noisy = any(run.truth is not None and not run.truth_is_exact for run in runs)
+    noisy = any(run.truth is not None and run.truth_noise != TruthNoise() for run in runs)
     title = "Online error since the start (solid), claimed σ (dashed)"
     title += "\nσ with that of the truth; grey: the truth is doubtful" if noisy else ""
+    title += "\nthe true path looks wrong" if any(run.summary.get("truth_doubt") for run in runs) else ""
     axes[0].set_title(title if known else "Claimed σ of the online pose; no true path is known")
     axes[-1].set_xlabel("time [s]")
     if len(runs) > 1:
