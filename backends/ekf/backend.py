@@ -8,7 +8,7 @@ from typing import Any
 from backends.ekf.filter import LandmarkFilter
 from backends.ekf.landmarks import COORDINATES
 from backends.ekf.motion import EulerCamera
-from slam.bounds import from_options, require_positive
+from slam.bounds import from_options, require_not_negative
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels, SlideModel
@@ -43,7 +43,7 @@ class EkfConfig:
     consistent: bool = True
 
     def __post_init__(self) -> None:
-        require_positive(self, {"iterations": (1, 1000)}, "ekf")
+        require_not_negative(self, {"iterations": (1, 1000)}, "ekf")
         if self.papers and replace(self, papers=False) != EkfConfig():
             raise ConfigurationError("ekf: papers=true chooses the other options itself; leave them out")
         for name, known in (("measurement", MEASUREMENTS), ("landmarks", tuple(COORDINATES))):

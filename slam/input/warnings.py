@@ -48,7 +48,10 @@ class InputWarnings:
         self.doubt = ""  # the first of those after which no path can be trusted
         self.repeated = ""  # the warning of repeated images
         self._rig, self._rows = rig, rows
-        self._farthest = farthest_apart(rig, models)
+        # Time between frames [s] after which the prediction's rotation error (1σ) moves a feature by half an image: the
+        # angular velocity changes by ``density · √Δt`` in Δt, and the rotation by that times Δt.
+        half_view = float(np.arctan(0.5 * rig.width / rig.left.fu))
+        self._farthest = (half_view / models.motion.angular_acceleration) ** (2 / 3)
         self._stamps: list[float] = []
         self._count = self._poor = self._unpaired = 0
         self._pair_warned = self._pair_is_right = False
@@ -293,15 +296,6 @@ def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
         f"rows of left and right image do not agree: {found.off_rows} of {found.matches} features are off by "
         f"{found.row_offset:.1f} px in the median; {cause}"
     )
-
-
-def farthest_apart(rig: StereoRig, models: EstimatorModels) -> float:
-    """Time between frames [s] after which the prediction's rotation error (1σ) moves a feature by half an image.
-
-    The angular velocity changes by ``density · √Δt`` in Δt, and the rotation by that times Δt.
-    """
-    half_view = float(np.arctan(0.5 * rig.width / rig.left.fu))
-    return float((half_view / models.motion.angular_acceleration) ** (2 / 3))
 
 
 def shows_something(image: object) -> bool:

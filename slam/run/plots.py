@@ -21,7 +21,6 @@ from slam.files import noting_inputs, whole_file
 from slam.geometry.se3 import Array, inverse, transform
 from slam.naming import unknown
 from slam.outputs import Output, require_outputs
-from slam.run.outputs import naming_folder
 from slam.run.results import facts, number
 from slam.run.run_data import RunData, place_of_truth, pose_errors, well_known
 from slam.run.schema import STAGE_NAMES, body_colour
@@ -76,7 +75,7 @@ def plot_folders(folders: Sequence[Path], out: Path | None, kind: str, overwrite
             f"runs of {len(sequences)} sequences ({', '.join(sequences)}): draw those of one at a time"
         )
     file = out or runs[0].folder / (PICTURE if kind == "summary" else f"{kind}.png")
-    require_outputs([Output(file, "--out", makes_folder=True)], inputs, overwrite)
+    require_outputs([Output(file, "--out")], inputs, overwrite)
     plot(runs, file, kind)
     return file
 
@@ -112,8 +111,6 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary") -> None:
     from matplotlib import rc_context
 
     figure = drawn(runs, kind)
-    with naming_folder(path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as file, rc_context(_STYLE):
         metadata = {"Title": _title(runs), **_METADATA[suffix]}
         figure.savefig(file, format=suffix[1:], dpi=110, metadata=metadata)

@@ -20,6 +20,7 @@ from slam.input.warnings import REPEATED
 from slam.interfaces import Backend, ConsideringBackend
 from slam.run.recording import Recording
 from slam.run.schema import STAGES
+from slam.run.truth_check import truth_doubt
 from slam.runtime.compilation import compile_clock
 from slam.sequences import Sequence
 from slam.sequences.live import LiveFrames
@@ -128,6 +129,12 @@ def results_of(
             "the back end claims a singular covariance for %d of %d poses: it is no uncertainty", none, len(path)
         )
     online, steps = path.select(measured), np.diff(path.positions, axis=0)
+    truth, noise = sequence.ground_truth, getattr(sequence, "truth_noise", TruthNoise())
+    doubt, wrong = "", False
+    if truth is not None and noise == TruthNoise() and sequence.format != "synthetic":  # it is taken as exact
+        doubt, wrong = truth_doubt(online, truth)
+    if doubt:
+        logger.warning("%s", doubt)
     speeds = np.linalg.norm(steps, axis=1) / np.diff(path.stamps)
     common = [record.common[row] for row in np.flatnonzero(measured)]
     found: dict[str, Any] = {
@@ -143,14 +150,15 @@ def results_of(
         },
         "consistency": {
             "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
-            **consistency(online, np.array(record.covariances)[measured], sequence, common),
+            **({} if wrong else consistency(online, np.array(record.covariances)[measured], sequence, common)),
         },
     }
     if none:
         found["consistency"]["singular covariances"] = none
-    noise: TruthNoise | None = getattr(sequence, "truth_noise", None)
-    if found["accuracy"]["online"] and noise is not None:  # for the picture's band, which is that of the verdict
+    if found["accuracy"]["online"]:  # for the picture's band, which is that of the verdict
         found["truth"] = asdict(noise)
+    if doubt:
+        found["truth_doubt"] = doubt
     if isinstance(system, StereoSlam):
         values = getattr(sequence, "values", None)  # of a world: with recordings nobody knows
         if "mean NEES" in found["consistency"] and system.config.self_calibration.enabled and values is not None:
