@@ -26,7 +26,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -41,7 +40,7 @@ from slam.bodies.regions import Region
 from slam.bodies.track_kernels import displaced
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray, IndexArray, StereoFeatures
-from slam.geometry.arrays import among
+from slam.geometry.arrays import among, quantile
 from slam.geometry.rig import measurement_rows
 from slam.geometry.se3 import Array, hat, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
@@ -51,8 +50,6 @@ FARTHEST = 4.0  #: a track's depth must be so many times its deviation
 _TAIL = 3.0  # tracks; see `limit`
 _UPPER_QUARTILE = chi_square_limit(3, 0.75)  # of χ²(3)
 _SIZES = np.array([[0.1, 0.1, 0.2], [0.2, 0.2, 0.4], [0.4, 0.4, 0.8]])  # of windows: x/z, y/z, logarithm of the depth
-_HALVES = 0.5 * np.array(list(product((0, 1), repeat=3)))  # of a width, by which windows of a size are apart
-_CELLS = 2**12  # numerics: more than there are windows along an axis
 # 0.1: from 0.25 on a box that starts carries the camera along
 _PRECISE = 0.1  # times the noise of a pixel: what it is from frame to frame at least, without what lasts
 
@@ -141,9 +138,9 @@ def classify_scene(moved: Displacements, place: Array, test: float) -> Scene:
         return Scene([], np.zeros(n), np.zeros(6), np.diag(1.0 / kernels.PRIOR))
     L, eta, dWd = kernels.normal_equations(moved.points, moved.d, moved.W, moved.lag)
     asked = limit(test, np.arange(n + 1, dtype=np.intp))
-    group, values, alone, common, scale = kernels.groups_apart(
-        L, eta, dWd, place, *_full_windows(place), asked, MIN_POINTS
-    )  # fmt: skip
+    codes = np.sort(kernels.window_codes(place, _SIZES))
+    windows = kernels.full_windows(codes, n, _SIZES, MIN_POINTS)
+    group, values, alone, common, scale = kernels.groups_apart(L, eta, dWd, place, *windows, asked, MIN_POINTS)
     rest = group < 0
     heavier = tail(alone[rest])  # of what is in no group: before, other groups would be part of it
     found = [(np.flatnonzero(group == k), value / heavier) for k, value in enumerate(values.tolist())]
@@ -158,28 +155,6 @@ def classify_scene(moved: Displacements, place: Array, test: float) -> Scene:
     return Scene(groups, alone, common, scale * heavier * np.linalg.inv(information))
 
 
-def _full_windows(place: Array) -> tuple[IndexArray, IndexArray, Array, Array]:
-    """Windows with enough tracks, of every size, each half a width from the next along every axis.
-
-    As starts (M + 1,) of the windows in the list of their tracks, that list, and centres and widths (M, 3).
-    """
-    at = place.T[:, None, None] / _SIZES.T[:, :, None, None] + [[0.0], [0.5]]
-    x, y, z = np.clip(np.floor(at).astype(np.int64) + _CELLS // 2, 0, _CELLS - 1)  # (S, 2, N) each, the 2 of offsets
-    kind = np.arange(len(_SIZES) * len(_HALVES)).reshape(-1, 2, 2, 2, 1)
-    code = ((kind * _CELLS + x[:, :, None, None]) * _CELLS + y[:, None, :, None]) * _CELLS + z[:, None, None]
-    bits = len(place).bit_length()
-    ordered = np.sort(((code << bits) + np.arange(len(place))).reshape(-1))  # quicker than to sort by code and stably
-    code, tracks = ordered >> bits, ordered & ((1 << bits) - 1)
-    first = np.flatnonzero(np.append(True, code[1:] != code[:-1]))
-    count = np.diff(np.append(first, len(code)))
-    full = count >= MIN_POINTS
-    code = code[first[full], None]
-    kind = code[:, 0] // _CELLS**3
-    size, half = _SIZES[kind // len(_HALVES)], _HALVES[kind % len(_HALVES)]
-    centres = (code // _CELLS ** np.array([2, 1, 0]) % _CELLS - _CELLS // 2 + 0.5 - half) * size
-    return np.append(0, np.cumsum(count[full])).astype(np.intp), tracks[np.repeat(full, count)], centres, size
-
-
 def _mean_gap(moved: Displacements, rows: IndexArray, common: Array) -> float:
     """How far tracks went against a common motion, in the weighted mean [m]."""
     W = moved.W[rows]
@@ -189,7 +164,7 @@ def _mean_gap(moved: Displacements, rows: IndexArray, common: Array) -> float:
 
 def tail(alone: Array) -> float:
     """How much heavier the tail of tracks' χ²(3) is, 1 at least: small groups agree by chance then."""
-    return max(1.0, float(np.quantile(alone, 0.75)) / _UPPER_QUARTILE) if len(alone) else 1.0
+    return max(1.0, quantile(alone, 0.75) / _UPPER_QUARTILE) if len(alone) else 1.0
 
 
 def find_groups(

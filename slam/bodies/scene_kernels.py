@@ -22,6 +22,7 @@ _EXPLAINED = 0.25  # share of χ² that the common motion may leave: an uneven m
 _BETTER = 4.0  # by how much χ² a member must fit its group's motion better than the rest's, and
 _BETTER_AROUND = 6.0  # where it lies outside the window
 _AROUND = 1.0  # how far beyond its window a group's tracks are looked for, in widths of the window
+_CELLS = 2**12  # numerics: more than there are windows along an axis
 _MOST = 20  # cost: windows looked into for the next group
 MEDIAN = chi_square_limit(3, 0.5)  #: of χ²(3)
 
@@ -131,70 +132,139 @@ def _solve(factor, right, out):
     solve_factorised(factor, 6, out)
 
 
-@helper
-def _times(triangle, v, out):
-    """The product of a triangle's matrix, with the prior on its diagonal, and a vector (6,)."""
-    for i in range(6):
-        out[i] = PRIOR[i] * v[i]
-    k = 0
-    for i in range(6):
-        for j in range(i):
-            out[i] += triangle[k] * v[j]
-            out[j] += triangle[k] * v[i]
-            k += 1
-        out[i] += triangle[k] * v[i]
-        k += 1
-
-
 # ---------------------------------------------------------------------------------------------- groups
 
 
-@helper
-def _window_tests(starts, tracks, L, eta, alone, scale, rest, asked, support, largest, clear):
-    """By how much the χ²(6) of every window exceeds what is asked, into `clear` (M,); −∞ where there is no test.
+@kernel
+def window_codes(place, sizes):
+    """A number for every window that a track at `place` (N, 3) is in, and the track itself in its last digits.
 
-    The test is whether the motion of the tracks inside is that of the rest; `asked` (N + 1,) is by their number.
+    Windows have `sizes` (S, 3), and each is half a width from the next along every axis: eight overlap. Sorted (8 S N,)
+    numbers have each window's tracks in a row.
     """
-    total, told = np.zeros(21), np.zeros(6)
-    for n in range(len(alone)):
-        if rest[n]:
-            weight = min(1.0, _PULL / max(alone[n], 1e-9)) / scale
-            _add_weighted(total, L[n], weight)
-            _add_weighted(told, eta[n], weight)
-    both, own, other = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
-    _factorise(total, 2.0, both)
-    inside, told_inside, outside, told_outside = np.empty(21), np.empty(6), np.empty(21), np.empty(6)
-    gap, motion, left, right = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
-    for m in range(len(clear)):
-        clear[m] = -np.inf
-        own_tracks = tracks[starts[m] : starts[m + 1]]
-        size = 0
-        for n in own_tracks:
-            size += rest[n]
-        if size < support or size > largest:
+    n = len(place)
+    codes = np.empty(8 * len(sizes) * n, np.int64)
+    k = 0
+    for kind in range(8 * len(sizes)):
+        for m in range(n):
+            code = kind
+            for axis in range(3):
+                cell = np.floor(place[m, axis] / sizes[kind // 8, axis] + _shift(kind, axis))
+                code = code * _CELLS + min(max(int(cell) + _CELLS // 2, 0), _CELLS - 1)
+            codes[k] = code * n + m
+            k += 1
+    return codes
+
+
+@helper
+def _shift(kind, axis):
+    """By which part of a width windows of a kind are shifted along an axis: the kind's last binary digits say where."""
+    return 0.5 * (kind >> (2 - axis) & 1)
+
+
+@kernel
+def full_windows(codes, n, sizes, least):
+    """Windows with at least so many of n tracks, by the sorted `window_codes`.
+
+    As starts (M + 1,) of the windows in the list of their tracks, that list, and centres and widths (M, 3).
+    """
+    most = len(codes) // least + 1
+    starts, tracks = np.empty(most + 1, np.int64), np.empty(len(codes), np.int64)
+    centres, widths = np.empty((most, 3)), np.empty((most, 3))
+    windows = size = first = 0
+    starts[0] = 0
+    for k in range(len(codes)):
+        code = codes[k] // n
+        if k + 1 < len(codes) and codes[k + 1] // n == code:
             continue
-        inside[:], told_inside[:] = 0.0, 0.0
-        for n in own_tracks:
-            if rest[n]:
-                weight = min(1.0, _PULL / max(alone[n], 1e-9)) / scale
-                _add_weighted(inside, L[n], weight)
-                _add_weighted(told_inside, eta[n], weight)
+        if k + 1 - first >= least:
+            for i in range(first, k + 1):
+                tracks[size] = codes[i] - code * n
+                size += 1
+            kind = code // _CELLS**3
+            for axis in range(2, -1, -1):
+                widths[windows, axis] = sizes[kind // 8, axis]
+                cell = code % _CELLS - _CELLS // 2
+                centres[windows, axis] = (cell + 0.5 - _shift(kind, axis)) * widths[windows, axis]
+                code //= _CELLS
+            windows += 1
+            starts[windows] = size
+        first = k + 1
+    return starts[: windows + 1], tracks[:size], centres[:windows], widths[:windows]
+
+
+@helper
+def _gain(triangle, gradient, factor, work):
+    """By how much a triangle's tracks fit better with a motion of their own, from the gradient (6,) at another."""
+    _factorise(triangle, 1.0, factor)
+    _solve(factor, gradient, work)
+    total = 0.0
+    for i in range(6):
+        total += gradient[i] * work[i]
+    return total
+
+
+@helper
+def _window_tests(starts, tracks, L, eta, dWd, alone, scale, rest, asked, support, largest, clear):
+    """By how much the χ²(6) of every window exceeds what is asked, into `clear` (M,); −∞ where it does not.
+
+    The test is whether the motion of the tracks inside is that of the rest; `asked` (N + 1,) is by their number. It is
+    what the tracks inside and those outside gain by motions of their own, beside the motion ξ that both share: ``gᵀ
+    (Λ_w⁻¹ + Λ_r⁻¹) g`` with the gradient ``g = Λ_w ξ − η_w``. The first gain is at most their χ² against ξ. With a
+    share of at most ``ρ = tr(Λ⁻¹ Λ_w)`` of the information along any motion, the sum is at most the first over 1 − ρ;
+    most windows need no more than these sums.
+    """
+    n = len(alone)
+    total, told, weight, off, hold = np.zeros(21), np.zeros(6), np.zeros(n), np.empty(n), np.empty(n)
+    for m in range(n):
+        if rest[m]:
+            weight[m] = min(1.0, _PULL / max(alone[m], 1e-9)) / scale
+            _add_weighted(total, L[m], weight[m])
+            _add_weighted(told, eta[m], weight[m])
+    factor, motion, products, shares = np.empty((6, 6)), np.empty(6), np.empty(21), np.empty(21)
+    inside, outside, gradient, column, unit = np.empty(21), np.empty(21), np.empty(6), np.empty(6), np.zeros(6)
+    _factorise(total, 2.0, factor)
+    _solve(factor, told, motion)
+    _products(motion, products)
+    prior_off = prior_hold = 0.0
+    for i in range(6):
+        unit[:] = 0.0
+        unit[i] = 1.0
+        _solve(factor, unit, column)
+        prior_off += PRIOR[i] * motion[i] ** 2
+        prior_hold += PRIOR[i] * column[i]
+        for j in range(i + 1):
+            shares[i * (i + 1) // 2 + j] = (1.0 if i == j else 2.0) * column[j]
+    for m in range(n):
+        off[m] = weight[m] * _square(L[m], eta[m], dWd[m], motion, products)
+        hold[m] = 0.0
+        for k in range(21):
+            hold[m] += weight[m] * L[m, k] * shares[k]
+    for w in range(len(clear)):
+        clear[w] = -np.inf
+        own = tracks[starts[w] : starts[w + 1]]
+        size, most, share = 0, prior_off, prior_hold
+        for m in own:
+            if rest[m]:
+                size, most, share = size + 1, most + off[m], share + hold[m]
+        if size < support or size > largest or most <= asked[size] * (1.0 - share):
+            continue
+        inside[:], gradient[:] = 0.0, 0.0
+        for m in own:
+            _add_weighted(inside, L[m], weight[m])
+            _add_weighted(gradient, eta[m], -weight[m])
+        for i in range(6):
+            gradient[i] += PRIOR[i] * motion[i]
+            for j in range(6):
+                gradient[i] += inside[max(i, j) * (max(i, j) + 1) // 2 + min(i, j)] * motion[j]
+        value = _gain(inside, gradient, factor, column)
+        if value <= asked[size] * (1.0 - share):
+            continue
         for k in range(21):  # expressions of arrays take seconds to compile
             outside[k] = total[k] - inside[k]
-        for i in range(6):
-            told_outside[i] = told[i] - told_inside[i]
-        _factorise(inside, 1.0, own)
-        _factorise(outside, 1.0, other)
-        _solve(own, told_inside, gap)
-        _solve(other, told_outside, motion)
-        for i in range(6):
-            gap[i] -= motion[i]
-        _times(inside, gap, left)
-        _times(outside, gap, right)
-        _solve(both, right, motion)
-        clear[m] = -asked[size]
-        for i in range(6):
-            clear[m] += left[i] * motion[i]
+        value += _gain(outside, gradient, factor, column) - asked[size]
+        if value > 0.0:
+            clear[w] = value
 
 
 @kernel
@@ -222,7 +292,7 @@ def groups_apart(L, eta, dWd, place, starts, tracks, centres, widths, asked, sup
             doubted[m] = not rest[m]
         if 3 * left < n or len(clear) == 0:
             break
-        _window_tests(starts, tracks, L, eta, alone, scale, rest, asked, support, LARGEST * left, clear)
+        _window_tests(starts, tracks, L, eta, dWd, alone, scale, rest, asked, support, LARGEST * left, clear)
         found = 0
         for _ in range(_MOST):
             window = np.argmax(clear)

@@ -57,7 +57,9 @@ class RunData:
         if not folder.exists():
             raise SlamError(f"{folder}: there is no such folder")
         if not (folder / "landmarks.csv").exists():
-            raise SlamError(f"{folder}: not the folder of a finished run: there is no landmarks.csv")
+            below = " ".join(sorted(str(path.parent) for path in folder.glob("*/landmarks.csv")))
+            hint = f"; below it are some: {below}" if below else ": there is no landmarks.csv"
+            raise SlamError(f"{folder}: not the folder of a finished run{hint}")
         try:
             return cls._read(folder, name)
         except (KeyError, IndexError, ValueError, TypeError, OverflowError, csv.Error) as error:

@@ -30,6 +30,8 @@ from slam.tracks.step import HIDDEN
 
 logger = logging.getLogger("slam.run")
 
+_DISAGREE = 0.1  # of a path's length, by which two estimates of its last pose cannot differ
+
 
 @dataclass(eq=False)
 class RunRecord:
@@ -123,6 +125,10 @@ def results_of(
         logger.warning(
             "the back end's trajectory() lacks %d of %d frames: it needs a pose for each", missing, len(path)
         )
+    if len(final) and final.stamps[-1] == path.stamps[-1]:
+        apart = float(np.linalg.norm(final.positions[-1] - path.positions[-1]))
+        if apart > _DISAGREE * path.length:
+            logger.warning("the back end's estimate() and trajectory() are %.3g m apart in the last frame", apart)
     none = int((~are_covariances(np.array(record.covariances[1:]).reshape(-1, 6, 6))).sum())
     if none:
         logger.warning(
