@@ -1,0 +1,96 @@
+"""Back ends on recorded stereo tracks of a drive, with its real outliers; skipped where they are not there.
+
+1142 m of KITTI as Kanade-Lucas-Tomasi tracks: no images, the association given.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+import backends
+from slam.config import SystemConfig
+from slam.data import Observations
+from slam.geometry.rig import StereoRig, measurement_rows
+from slam.geometry.se3 import inverse
+from slam.window.consensus import find_consensus
+
+FILE = "kitti_raw_tracks/2011_09_30_drive_0020"
+SIZE = (1226, 370)  # of the rectified images [px]
+
+
+def load(folder):
+    """Rig, stamps (K,) [s], true T_world_left (K, 4, 4) by GPS, and pixels (K, J, 4) = (uL, vL, uR, vR), NaN unseen."""
+    raw = loadmat(folder / f"{FILE}_sync_KLT.mat")
+    poses = np.tile(np.eye(4), (raw["t"].shape[1], 1, 1))
+    poses[:, :3] = np.loadtxt(folder / f"{FILE}_poses_cam0_oxts.txt").reshape(-1, 3, 4)[: len(poses)]
+    f, u0, v0, b = (float(raw[name].item()) for name in ("fu", "cu", "cv", "b"))
+    pixels = raw["y_k_j"].transpose(1, 2, 0).copy()
+    pixels[(pixels < 0).any(axis=2)] = np.nan
+    return StereoRig.rectified_pair(f, u0, v0, b, *SIZE), raw["t"][0], poses, pixels
+
+
+def observed(pixels, wrong, k):
+    """What was measured in a frame, a share `wrong` of it with the pixels of other tracks; ids are tracks' numbers."""
+    ids = np.flatnonzero(np.isfinite(pixels[:, 0]))
+    pixels = pixels[ids]
+    chosen = np.random.default_rng([k, 1]).permutation(len(ids))[: round(wrong * len(ids))]
+    pixels[chosen] = pixels[np.roll(chosen, 1)]
+    return Observations(ids, pixels[:, :2], pixels[:, 2:])
+
+
+def agreed(rig, backend, seen, expected, config, seed):
+    """The pose (4, 4) on which most observations agree; None without any."""
+    if not len(seen):
+        return None
+    z = measurement_rows(seen.uv_left, seen.uv_right)
+    threshold = config.association.consistency_sigmas * config.models.pixel_sigma
+    hypotheses = config.association.hypotheses
+    return find_consensus(rig, backend.positions(seen.ids), z, expected, threshold, hypotheses, seed).T_world_left
+
+
+def replayed(folder, name, start, stop, wrong=0.0):
+    """The reports of a replay, the back end, and how far it is off over the whole stretch [m]."""
+    rig, stamps, true, pixels = load(folder)
+    config = SystemConfig.for_kind("driving", None)
+    backend = backends.create(name, rig, models=config.models, **config.backend)
+    known, reports, poses = set(), [], []
+    for k in range(stop - start):
+        seen = observed(pixels[start + k], wrong, k)
+        old = np.array([i in known for i in seen.ids.tolist()], bool)
+        deep = ~old & np.isfinite(rig.triangulate(seen.uv_left, seen.uv_right)).all(axis=1)
+        new = seen.select(np.flatnonzero(deep)[: max(0, config.map.target_in_view - int(old.sum()))])
+        ended = sorted(known - set(seen.ids.tolist()))
+        prediction = backend.predict(float(stamps[start + k]))
+        guess = agreed(rig, backend, seen.select(old), prediction.T_world_left, config, k)
+        reports.append(backend.update(seen.select(old), guess))
+        backend.add(new)
+        backend.remove(ended)
+        poses.append(backend.estimate(landmarks=False).T_world_left)
+        known = (known | set(new.ids.tolist())) - set(ended)
+    moved = inverse(poses[0]) @ poses[-1]
+    return reports, backend, np.linalg.norm(moved[:3, 3] - (inverse(true[start]) @ true[stop - 1])[:3, 3])
+
+
+@pytest.mark.parametrize("name", ["ekf", "smoother", "window"])
+def test_the_first_frames_are_not_rejected(slam_data, name):
+    """At 11 m/s, of which nothing is known at first. The truth of these frames is off by 1.4 m itself.
+
+    Disparities of frame 0 are half of those of frame 1, so its landmarks are rejected rightly.
+    """
+    reports, _, off = replayed(slam_data, name, 2, 27)
+    assert all(report.status.value == "ok" and len(report.used) > len(report.rejected) for report in reports[1:])
+    assert off < 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", [0.0, 0.2])
+@pytest.mark.parametrize("name", ["ekf", "smoother", "window"])
+def test_far_tracks_alone_do_not_make_it_run_away(slam_data, name, wrong):
+    """Where all tracks were 80 m away, each frame was solved again from frame 435 on, and was off by up to 16 m."""
+    reports, backend, off = replayed(slam_data, name, 370, 450, wrong)
+    assert {report.status.value for report in reports[1:]} == {"ok"}
+    assert getattr(backend, "rebuilds", 0) == 0
+    assert off < 8
+    assert np.median([len(r.used) / (len(r.used) + len(r.rejected)) for r in reports[1:]]) > 0.9 - 2 * wrong
