@@ -162,6 +162,7 @@ class Covariance:
         by_rig += K @ by_rig[:CAMERA]
         P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]
         summands = self.P.diagonal() + 2 * (half * K).sum(axis=1)
+        summands[last] = 0.0
         return replace(self, P=positive(mirrored(P), summands, V.shape[1]), by_rig=by_rig)
 
     def displaced(self, rows: IndexArray, change: Array, shift: Array) -> Covariance:

@@ -203,7 +203,10 @@ class LandmarkFilter:
         return np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4)
 
     def _predicted(self, stamp: float, rests: bool) -> Prediction:
-        """Go to a time, and say what is in the angle of view then; whether the camera rests meanwhile."""
+        """Go to a time, and say what is in the angle of view then; whether the camera rests meanwhile.
+
+        Features slide as the viewpoint changes: this widens the landmarks in view (`FilterState.slid`).
+        """
         s = self.state
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
         if s.frame < 0:

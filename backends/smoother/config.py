@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from slam.bounds import require_not_negative
+from slam.errors import ConfigurationError
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,9 @@ class SmootherConfig:
         landmarks: most landmarks that are variables of the graph. Where a frame measures no more than these, those that
             are measured for longer than a smart factor spans become variables, and keep what it says of them; but only
             while they are linear in space to less than a pixel's noise.
+        poses: which frames give the graph their measurements: ``"every"`` one, or, for ``"seen"``, those that measure
+            less than half of the landmarks that the last one did, or come half a factor after it. The others are solved
+            for alone, from the landmarks as they stand; the graph has them by their motion and this solution.
         past: number of poses before those, at least, whose measurements are kept (half as many poses more before
             they are thrown away): where landmarks are seen again, or measurements are mended, they say where those are.
 
@@ -29,8 +33,11 @@ class SmootherConfig:
     track: int = 20
     lag: int | None = 16
     landmarks: int = 20
+    poses: str = "every"
     past: int = 50
 
     def __post_init__(self) -> None:
         ranges = {"track": (2, 10**6), "lag": (2, 10**6), "landmarks": (0, 10**6), "past": (0, 10**6)}
         require_not_negative(self, ranges, "smoother")
+        if self.poses not in ("every", "seen"):
+            raise ConfigurationError(f"smoother: poses must be every or seen, got {self.poses!r}")

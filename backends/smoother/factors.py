@@ -61,9 +61,9 @@ class FactorMaker:
         """A pose is T (4, 4) with a covariance (6, 6)."""
         return gtsam.PriorFactorPose3(pose_key(pose), to_pose3(T), gtsam.noiseModel.Gaussian.Covariance(covariance))
 
-    def tie(self, earlier: int, later: int, relative: Array, sigmas: float | Array) -> gtsam.NonlinearFactor:
-        """A pose relative to an earlier one (4, 4), with standard deviations (6,) [rad], [m]."""
-        noise = gtsam.noiseModel.Diagonal.Sigmas(np.broadcast_to(sigmas, 6))
+    def tie(self, earlier: int, later: int, relative: Array, covariance: Array) -> gtsam.NonlinearFactor:
+        """A pose relative to an earlier one (4, 4), with a covariance (6, 6)."""
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
         return gtsam.BetweenFactorPose3(pose_key(earlier), pose_key(later), to_pose3(relative), noise)
 
     def motion(self, keys: Sequence[int], dt: Array) -> gtsam.NonlinearFactor:

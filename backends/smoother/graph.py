@@ -171,9 +171,12 @@ class Graph:
         P = self._joint(list(range(begin, solved + 1)))
         for number in range(solved + 1, last + 1):
             _, J, noise, _ = s.moved(self._make.models, number)
-            J = J[:, -len(P) :]
-            cross = J @ P[-J.shape[1] :]
-            P = np.block([[P, cross.T], [cross, cross[:, -J.shape[1] :] @ J.T + noise]])
+            J, columns, aside = J[:, -len(P) :], slice(len(P) - min(len(P), 12), len(P)), s.aside.get(number)
+            if aside is not None and aside.anchor >= begin:
+                J, noise = adjoint(inverse(aside.relative)), aside.own
+                columns = slice(6 * (aside.anchor - begin), 6 * (aside.anchor - begin) + 6)
+            cross = J @ P[columns]
+            P = np.block([[P, cross.T], [cross, cross[:, columns] @ J.T + noise]])
         rows = slice(6 * (first - begin), 6 * (last + 1 - begin))
         return first, P[rows, rows]
 

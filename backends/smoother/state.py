@@ -45,11 +45,21 @@ class Known:
 
 
 @dataclass(frozen=True, eq=False)
+class Aside:
+    """A pose that was solved for alone, from the landmarks as they stood."""
+
+    anchor: int  # number of the pose that it is relative to
+    relative: Array  # (4, 4)
+    covariance: Array  # of that, by its measurements (6, 6)
+    own: Array  # and by the motion, too (6, 6)
+
+
+@dataclass(frozen=True, eq=False)
 class SmootherState:
     """The poses of all frames that are kept, by number, and the landmarks.
 
-    A pose from which nothing was measured follows from the motion model alone. What was measured lately, and where
-    landmarks are, is relative to the anchor: the last pose that measured or added a landmark.
+    A pose from which nothing was measured follows from the motion model alone. The last two poses' covariances, and
+    those of landmarks, are relative to the anchor.
     """
 
     first: int  # number of the first pose that is kept
@@ -63,13 +73,15 @@ class SmootherState:
     pair: Array  # joint covariance (12, 12) of the errors of the last two poses relative to the anchor
     shared: Array  # covariance (6, 12) of the anchor's own error in the world with these
     by_rig: Array  # derivatives of the last two poses' errors by errors of the rig (12, m)
-    # covariance (6, 6) of the pose with which the problem begins before anything was measured from it, and that of its
-    # attitude about the world's axes (3, 3) [rad²]
+    # of the pose with which the problem begins, before anything was measured from it: covariance (6, 6), where it was
+    # believed to be (4, 4), and the covariance of its attitude about the world's axes (3, 3) [rad²]
     prior: Array = field(default_factory=lambda: np.zeros((6, 6)))
-    start: Array = field(default_factory=lambda: np.eye(4))  # where that pose was believed to be then (4, 4)
+    start: Array = field(default_factory=lambda: np.eye(4))
     turned: Array = field(default_factory=lambda: np.zeros((3, 3)))
-    anchor: int = 0  # number of that pose
+    anchor: int = 0  # number of the last pose that measured or added a landmark
     solved: int = -1  # number of the newest pose that the graph solved for; −1 for none
+    chosen: int = -1  # number of the last pose whose measurements the graph was given
+    aside: Mapping[int, Aside] = field(default_factory=dict)  # by number: poses that were solved for alone
     landmarks: SmootherLandmarks = field(default_factory=SmootherLandmarks.none)
     serials: int = 0  # number of landmarks so far
     known: Mapping[int, Known] = field(default_factory=dict)  # by serial number
@@ -137,4 +149,5 @@ class SmootherState:
             ages=self.ages[gone:], sights=self.sights[gone:], spread=self.spread[gone:],
             landmarks=self.landmarks.folded(self.first + gone, oldest),
             known={k: one for k, one in self.known.items() if not 0 <= one.pose < self.first + gone},
+            aside={k: one for k, one in self.aside.items() if k >= self.first + gone},
         )  # fmt: skip

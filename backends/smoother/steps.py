@@ -14,7 +14,7 @@ import numpy as np
 from backends.smoother.config import SmootherConfig
 from backends.smoother.graph import Graph, Solved, SolverError
 from backends.smoother.landmarks import VARIABLE, SmootherLandmarks, inverses
-from backends.smoother.state import Known, Sight, SmootherState
+from backends.smoother.state import Aside, Known, Sight, SmootherState
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
 from slam.window import pose_only
@@ -23,6 +23,7 @@ from slam.window.gating import MIN_CONSENSUS
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.stereo import RectifiedMeasurement, relative_covariance
 
+_SAME = 0.5  # share of a pose's landmarks that another one must measure to say nothing new
 _ALONE: tuple[Array, Array] = np.zeros((12, 12)), np.zeros((6, 12))  # `pair` and `shared` of a first pose
 
 
@@ -55,12 +56,10 @@ class Steps(RectifiedMeasurement):
         cross = J @ s.pair[:, 6:]
         own = _carried(J, s.pair) + noise
         own = 0.5 * (own + own.T)
-        shared, at = s.shared @ J.T, s.of(s.anchor)
-        # It moves as the last poses did, so what it is off by relative to the anchor has to do with that one's error.
-        A = np.concatenate([adjoint(inverse(T) @ s.poses[at]), np.eye(6)], axis=1)
-        P = _carried(A, np.block([[s.spread[at], shared], [shared.T, own]]))
+        shared = s.shared @ J.T
+        P = _in_world(s, T, shared, own)
         return replace(
-            s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread, 0.5 * (P + P.T)[None]]),
+            s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread, P[None]]),
             pair=np.block([[s.own, cross.T], [cross, own]]), shared=np.concatenate([s.shared[:, 6:], shared], axis=1),
             by_rig=np.concatenate([s.by_rig[6:], J @ s.by_rig]),
         )  # fmt: skip
@@ -129,11 +128,11 @@ class Steps(RectifiedMeasurement):
         own = marks.from_newest[seen]
         marks.by_rig[seen] = _landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
         if unknown_turn(s.own):
-            P = np.linalg.inv(one.information + G.T @ G)
-            at = s.of(s.anchor)
-            A = adjoint(inverse(found.T) @ s.poses[at])
-            P = world_covariance(s.spread[-1]) if marks.world[seen].any() else A @ s.spread[at] @ A.T + P
+            P = _in_world(s, found.T, np.zeros((6, 6)), np.linalg.inv(one.information + G.T @ G))
+            P = world_covariance(s.spread[-1]) if marks.world[seen].any() else P
             return self._anew(s, graph, found.T, P, seen, z[used])
+        if self.config.poses == "seen" and self._saw_the_same(s, marks.serial[seen]):
+            return _aside(s, found.T, G.T @ G, by_rig), nis, ""
         linear = math.sqrt(self.stereo.f / self.models.pixel_sigma)
         marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T, linear)
         marks = marks.measured(seen, z[used], number, self.track, s.oldest(self.config.lag, number), graph.number)
@@ -160,6 +159,11 @@ class Steps(RectifiedMeasurement):
         s = replace(s, sights=(*s.sights[:-1], Sight.of(marks, seen, z)), landmarks=marks)
         return self.settled(s, graph.rebuilt(s)), float("nan"), ""
 
+    def _saw_the_same(self, s: SmootherState, serials: IdArray) -> bool:
+        """Whether the newest pose measured at least half of what the last one in the graph did, not long ago."""
+        near = s.begun <= s.chosen and s.number - s.chosen <= self.track // 2
+        return near and np.isin(s.sights[s.of(s.chosen)].serials, serials).mean() >= _SAME
+
     def settled(self, s: SmootherState, solved: Solved) -> SmootherState:
         """The state with what the graph says: the newest pose is the anchor."""
         poses = np.concatenate([s.poses[: s.of(solved.first)], solved.poses])
@@ -172,7 +176,8 @@ class Steps(RectifiedMeasurement):
         known = {n: s.known[n] for n in s.sights[-1].serials.tolist() if n in s.known and s.known[n].used < 0}
         used = {n: replace(one, used=s.number) for n, one in known.items()}
         s = replace(
-            s, poses=poses, pair=pair, shared=shared, spread=spread, landmarks=marks, anchor=s.number, solved=s.number,
+            s, poses=poses, pair=pair, shared=shared, spread=spread, landmarks=marks,
+            anchor=s.number, solved=s.number, chosen=s.number,
             known={**s.known, **used} if used else s.known,
         )  # fmt: skip
         lag = self.config.lag
@@ -238,6 +243,35 @@ def _begun(s: SmootherState, T: Array, P: Array) -> SmootherState:
         pair=pair, shared=shared, prior=P, start=T, turned=T[:3, :3] @ P[:3, :3] @ T[:3, :3].T,
         begun=s.number, anchor=s.number, landmarks=s.landmarks.without_measurements(np.ones(len(s.landmarks), bool)),
         known={serial: one for serial, one in s.known.items() if one.pose < 0},
+    )  # fmt: skip
+
+
+def _in_world(s: SmootherState, T: Array, shared: Array, own: Array) -> Array:
+    """Covariance (6, 6) in the world of a pose T (4, 4) with a covariance `own` relative to the anchor.
+
+    `shared` (6, 6) is that of the anchor's own error with it: a pose that moves on as the last ones did is off by that.
+    """
+    at = s.of(s.anchor)
+    A = np.concatenate([adjoint(inverse(T) @ s.poses[at]), np.eye(6)], axis=1)
+    P = _carried(A, np.block([[s.spread[at], shared], [shared.T, own]]))
+    return 0.5 * (P + P.T)
+
+
+def _aside(s: SmootherState, T: Array, information: Array, by_rig: Array) -> SmootherState:
+    """With the newest pose at T (4, 4), by measurements with an information (6, 6) that the graph is not given.
+
+    Its derivatives by errors of the rig are `by_rig` (6, m).
+    """
+    before = np.linalg.inv(s.own)
+    less = before - before @ np.linalg.inv(before + information) @ before
+    pair, shared = (P - P[:, 6:] @ less @ s.pair[6:] for P in (s.pair, s.shared))
+    pair = 0.5 * (pair + pair.T)
+    one = Aside(s.anchor, inverse(s.poses[s.of(s.anchor)]) @ T, np.linalg.inv(information), pair[6:, 6:])
+    P = _in_world(s, T, shared[:, 6:], pair[6:, 6:])
+    return replace(
+        s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread[:-1], P[None]]),
+        pair=pair, shared=shared, by_rig=np.concatenate([s.by_rig[:6], by_rig]),
+        aside={**s.aside, s.number: one},
     )  # fmt: skip
 
 

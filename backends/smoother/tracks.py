@@ -17,7 +17,7 @@ from slam.window.motion import STANDS, is_first
 #: Times of variables, as gtsam's stubs have them.
 Stamps = dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex]
 
-_LOOSE = np.repeat([3.0, 100.0], 3)  # numerics: deviations [rad], [m] of a motion that is unknown
+_LOOSE = np.diag(np.repeat([9.0, 1e4], 3))  # numerics: variances [rad²], [m²] of a motion that is unknown
 _LONGEST = 64  # cost: measurements in a factor of what was a variable; its cost grows with their square
 
 
@@ -73,6 +73,9 @@ class Tracks:
         """A pose, and its motion since the one before it, if it is not the first one."""
         if number > first:
             problem.factors.add(self._motion(s, number, first))
+        aside = s.aside.get(number)
+        if aside is not None and aside.anchor >= first:
+            problem.factors.add(self._make.tie(aside.anchor, number, aside.relative, aside.covariance))
         problem.values.insert(pose_key(number), to_pose3(problem.to_graph @ s.poses[s.of(number)]))
         problem.stamps[pose_key(number)] = float(s.ages[s.of(number)])
 
@@ -83,7 +86,7 @@ class Tracks:
         """
         row, (dt, before) = s.of(number), s.intervals(number)
         if s.rests[row]:
-            return self._make.tie(number - 1, number, np.eye(4), STANDS)
+            return self._make.tie(number - 1, number, np.eye(4), STANDS**2 * np.eye(6))
         if not is_first(before, dt) and number - 2 < first:
             return self._make.tie(number - 1, number, inverse(s.poses[row - 1]) @ s.poses[row], _LOOSE)
         count = 2 if is_first(before, dt) else 3

@@ -48,7 +48,7 @@ def tracked(data, **options):
     return backend
 
 
-OPTIONS = [{}, {"track": 3}, {"lag": None}, {"lag": 4, "past": 0}]
+OPTIONS = [{}, {"track": 3}, {"lag": None}, {"lag": 4, "past": 0}, {"poses": "seen"}]
 
 
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
@@ -60,7 +60,7 @@ def test_the_path_and_its_covariance_with_all_options(options):
     last = backend.estimate(landmarks=False)
     off = se3.log(se3.inverse(last.T_world_left) @ data.poses[-1])
     assert off @ np.linalg.solve(last.covariance, off) < 25  # χ²₆ exceeds that once in 3000 times
-    assert backend.revises_path == (options.get("lag", 16) is None)
+    assert backend.revises_path == (options.get("lag", 16) is None or "poses" in options)
     assert (len(backend.state.sights) < 9) == ("past" in options), "what is kept does not grow for ever"
 
 
