@@ -39,7 +39,7 @@ class BatchBackend:
 
     `estimate` and `trajectory` raise `SlamError` where gtsam cannot solve the problem.
 
-    A smoother runs along, of whose graph every measured frame is a pose: it predicts, gates and gives the first values.
+    A smoother runs along: it predicts, gates and gives the first values.
     All but `estimate` and `trajectory` are its own methods (`SmootherBackend`). The problem is solved when the path or
     the landmarks are asked for; the pose alone is the smoother's. Where gtsam cannot give covariances for the solution,
     they are the smoother's, too, and a warning is logged.
@@ -90,7 +90,7 @@ class BatchBackend:
         s = self._smoother.state
         if not s.started:
             return self._smoother.trajectory()
-        found, solved = self._smoother.path.trajectory(s), self._solved().poses
+        found, solved = self._smoother.path.trajectory(), self._solved().poses
         found.poses[-len(solved) :] = solved
         return found
 
@@ -107,19 +107,13 @@ class _BatchSolution:
     def __init__(self, smoother: SmootherBackend) -> None:
         s, make = smoother.state, smoother.factor_maker
         self.state = s  # what it is the solution for
-        numbers = range(s.begun, s.number + 1)
-        stamps, hangs = smoother.path.frames(s.begun)
-        before = smoother.path.trajectory(s).poses[-len(stamps) :]
-        keys = [  # frames that are no pose of the smoother's graph are variables of their own, f
-            pose_key(number) if not i or number != hangs[i - 1] else int(gtsam.symbol("f", i))
-            for i, number in enumerate(hangs.tolist())
-        ]
+        numbers, begin = range(s.begun, s.number + 1), s.of(s.begun)
+        keys = [pose_key(number) for number in numbers]
         problem, tracks = GraphProblem(), Tracks(make, None)
         problem.factors.add(make.prior(s.begun, s.start, s.prior))
-        tracks.add_pose(problem, s, s.begun, s.begun)
-        for key, T in zip(keys[1:], before[1:]):
+        for key, T in zip(keys, s.poses[begin:]):
             problem.values.insert(key, to_pose3(T))
-        for factor in _motions(keys, np.diff(stamps).clip(max=LONGEST), make):
+        for factor in _motions(keys, np.diff(s.stamps[begin:]).clip(max=LONGEST), make):
             problem.factors.add(factor)
         places = _places(s, make.stereo, numbers)
         known = {serial for serial, one in s.known.items() if one.pose < 0 or one.pose >= s.begun}

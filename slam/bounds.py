@@ -27,47 +27,33 @@ _C = TypeVar("_C")
 Ranges = Mapping[str, tuple[float, float]]
 
 
-def require_positive(config: object, ranges: Ranges | None = None, owner: str = "", positive: bool = True) -> None:
-    """Check the types of a configuration dataclass, and that its numbers are positive and in their ranges.
+def require_not_negative(config: object, ranges: Ranges | None = None, owner: str = "") -> None:
+    """Check the types of a configuration dataclass, and that its numbers are finite, not negative, and in their ranges.
 
-    `ranges` has least and largest values by field, both allowed; default: `LEAST` to `MOST`, counts to a million.
-    `owner` says whose settings they are. Raises ConfigurationError.
+    `ranges` has least and largest values by field, both allowed. Without one a number is zero, or `LEAST` to `MOST`;
+    counts go to a million. `owner` says whose settings they are. Raises ConfigurationError.
     """
     mark, hints = f"{owner}: " if owner else "", _hints(type(config))  # type: ignore[arg-type]
     for f in fields(config):  # type: ignore[arg-type]
         value, limits = getattr(config, f.name), (ranges or {}).get(f.name)
         fault = _type_fault(value, hints[f.name])
         numbers_of = value if isinstance(value, (tuple, list)) and not fault else (value,)
-        faults = [fault, *(_range_fault(number, limits, positive) for number in numbers_of if not fault)]
+        faults = [fault, *(_range_fault(number, limits) for number in numbers_of if not fault)]
         if wanted := next(filter(None, faults), ""):
             raise ConfigurationError(f"{mark}{f.name} must be {wanted}, got {value!r}")
 
 
-def require_not_negative(config: object, ranges: Ranges | None = None, owner: str = "") -> None:
-    """As `require_positive`, for numbers that may be zero."""
-    require_positive(config, ranges, owner, positive=False)
-
-
-def _range_fault(value: Any, limits: tuple[float, float] | None, positive: bool) -> str:
+def _range_fault(value: Any, limits: tuple[float, float] | None) -> str:
     """What is required of a number outside its range; empty if it is inside, or no number."""
     if not isinstance(value, numbers.Real) or isinstance(value, (bool, np.bool_)):
         return ""
     number: Any = value
-    whole = isinstance(number, numbers.Integral)
-    text = "positive and finite" if positive else "finite and not negative"
-    if limits is not None and number == limits[1]:  # which may be infinite
-        return ""
-    if not (whole or np.isfinite(number)) or number < 0 or (positive and number == 0):
-        return text
-    least, most = limits or (0 if whole else LEAST, _COUNTS if whole else MOST)
-    zero = number == 0 and limits is None and not positive
-    return "" if zero or least <= number <= most else f"{text}, from {least:g} to {most:g}"
+    least, most = limits or (0, _COUNTS if isinstance(number, numbers.Integral) else MOST)
+    tiny = limits is None and 0 < number < LEAST
+    return "" if least <= number <= most and not tiny else f"finite, from {least:g} to {most:g}"
 
 
-@lru_cache(maxsize=64)
-def _hints(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind)
-
+_hints = lru_cache(maxsize=64)(get_type_hints)
 
 #: By type: what a value is an instance of, and that in words.
 _TYPES: dict[Any, tuple[Any, str]] = {

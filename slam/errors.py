@@ -76,5 +76,9 @@ class CopyError(SlamError, TypeError):
     """An object can be neither copied nor pickled; the message says what to do instead."""
 
 
+class AnswerError(SlamError):
+    """A back end or front end returned something else than its protocol says."""
+
+
 class PartError(SlamError):
     """A third-party back end or front end raised an exception of its own, which is the ``__cause__``."""

@@ -13,7 +13,7 @@ import os
 import secrets
 import stat
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
@@ -97,11 +97,11 @@ def read_object(path: str | Path) -> dict[str, Any]:
     return tree
 
 
-def unpack(data: bytes, source: str, error: type[SlamError] = SlamError) -> dict[str, bytes]:
-    """The members of a zip archive by name; `source` is its name, for messages.
+def unpack(data: bytes, source: str, needed: Iterable[str] = (), error: type[SlamError] = SlamError) -> dict[str, Any]:
+    """The members of a zip archive: arrays by their names without ``.npy``, others as bytes; `source` is for messages.
 
-    Raises `error` where it is damaged, encrypted, compressed in an unusual way, or would unpack to far more than its
-    size.
+    Raises `error` where it is damaged, encrypted, compressed in an unusual way, would unpack to far more than its size,
+    lacks a member that is `needed`, or has an array of anything but numbers or text.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as file:
@@ -114,20 +114,20 @@ def unpack(data: bytes, source: str, error: type[SlamError] = SlamError) -> dict
             for m in members:
                 if m.flag_bits & 1 or m.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                     raise ValueError(f"{m.filename} is encrypted, or packed in a way that is not known")
-            return {m.filename: file.read(m) for m in members}
+            if lacking := {*needed} - {name.removesuffix(".npy") for name in names}:
+                raise ValueError(f"it lacks {min(lacking)}")
+            contents = {m.filename: file.read(m) for m in members}
+            return {n.removesuffix(".npy"): _array(d, n) if n.endswith(".npy") else d for n, d in contents.items()}
     except Exception as fault:  # the libraries raise some fifteen kinds of them for damaged archives
         raise error(f"{source}: damaged, or no archive of arrays: {_text(fault)}") from fault
 
 
-def array(data: bytes, name: str, source: str, error: type[SlamError] = SlamError) -> np.ndarray:
-    """The array of numbers or text in an ``.npy`` member; raises `error` where it is none."""
-    try:
-        found = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-        if found.dtype.kind not in _KINDS or not found.dtype.itemsize:
-            raise ValueError(f"of type {found.dtype}")
-        return np.asarray(found, order="C")
-    except Exception as fault:  # likewise
-        raise error(f"{source}: {name} cannot be read as an array: {_text(fault)}") from fault
+def _array(data: bytes, name: str) -> np.ndarray:
+    """The array of numbers or text in an ``.npy`` member; raises ValueError, among others, where it is none."""
+    found = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+    if found.dtype.kind not in _KINDS or not found.dtype.itemsize:
+        raise ValueError(f"{name} is of type {found.dtype}")
+    return np.asarray(found, order="C")
 
 
 class Kind(NamedTuple):
@@ -238,11 +238,9 @@ def remove_file(path: Path) -> None:
 
 
 def _require_target(path: Path, error: type[SlamError]) -> None:
-    """Raise `error` where there is no folder for a file, or something else at its place: a device, a pipe."""
+    """Raise `error` where there is something else at a file's place: a device, a pipe."""
     if "\0" in str(path):
         raise error(f"{path}: no possible file name")
-    if not path.parent.is_dir():
-        raise error(f"{path}: cannot be written: there is no folder {path.parent}")
     with suppress(FileNotFoundError):
         if not stat.S_ISREG(path.stat().st_mode):  # raises for links in a circle
             raise error(f"{path}: cannot be written: there is something that is not a regular file")
@@ -250,7 +248,7 @@ def _require_target(path: Path, error: type[SlamError]) -> None:
 
 @contextmanager
 def whole_file(path: str | Path, error: type[SlamError] = SlamError) -> Iterator[BinaryIO]:
-    """A file to write to, which replaces the old one only when it is complete and on the disk.
+    """A file to write to, which replaces the old one only when it is complete and on the disk; its folder is made.
 
     Raises `error` where it cannot be written; nothing is left of it then.
     """
@@ -258,6 +256,7 @@ def whole_file(path: str | Path, error: type[SlamError] = SlamError) -> Iterator
     try:
         _require_target(place, error)
         place = place.resolve()  # a link stays a link
+        place.parent.mkdir(parents=True, exist_ok=True)
         beside = place.with_name(f".{secrets.token_hex(8)}.part")
         with beside.open("xb") as file:
             temporary = beside

@@ -53,9 +53,9 @@ class _Guarded:
             raise AttributeError(attribute)
         return getattr(self._backend, attribute)
 
-    def _require(self, ids: IdArray | Sequence[int] = (), known: bool = True) -> list[int]:
+    def _require(self, ids: IdArray | Sequence[int] = (), known: bool = True, begun: bool = True) -> list[int]:
         """Ids as numbers; raises MeasurementError before the start, or where one is not in the map, or in it."""
-        if np.isnan(self._stamp):
+        if begun and np.isnan(self._stamp):
             raise MeasurementError(f"{self._name}: the first call is predict")
         numbers: list[int] = np.asarray(ids, np.int64).tolist()
         for i in numbers:
@@ -94,7 +94,7 @@ class _Guarded:
             self._measured = True
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
-        gone = self._require(ids)
+        gone = self._require(ids, begun=False)
         self._backend.remove(np.array(gone, np.int64))
         self._ids = self._ids - set(gone)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slam.bounds import LEAST, require_not_negative, require_positive
+from slam.bounds import LEAST, require_not_negative
 from slam.checks import is_rigid
 from slam.chi_square import SIGMAS
 from slam.errors import ConfigurationError
@@ -22,7 +22,7 @@ _DENSITIES = (1e-6, 1e6)  # of velocity noise
 _SIGMAS = (1e-7, 1e6)  # of the initial state
 _RANGES = {
     "pixel_sigma": (1e-3, 1e3),
-    "gate_probability": (0.0, 1.0),
+    "gate_probability": (LEAST, 1 - LEAST),
     "initial_position_sigma": _SIGMAS,
     "initial_rotation_sigma": (1e-7, 10.0),
     "initial_velocity_sigma": _SIGMAS,
@@ -33,7 +33,7 @@ _BODY_RANGES = {
     "angular_acceleration": _DENSITIES,
     "initial_velocity_sigma": _SIGMAS,
     "initial_angular_velocity_sigma": (1e-7, 1e3),
-    "points": (1, 1000),
+    "points": (3, 1000),
     "max_speed": (1e-6, 1e6),
     "max_acceleration": (1e-6, 1e9),
     "max_turn_rate": (1e-6, 1e6),
@@ -59,7 +59,7 @@ class MotionModel:
     wheels: bool = False
 
     def __post_init__(self) -> None:
-        require_positive(self, {"acceleration": _DENSITIES, "angular_acceleration": _DENSITIES})
+        require_not_negative(self, {"acceleration": _DENSITIES, "angular_acceleration": _DENSITIES})
 
     def velocity_variance(self, dt: float) -> tuple[float, float]:
         """Variances of w_v [m²/s²] and w_ω [rad²/s²] over `dt` [s]."""
@@ -99,8 +99,6 @@ class ObjectModels:
 
     def __post_init__(self) -> None:
         require_not_negative(self, _BODY_RANGES, "objects")
-        if self.points < 3:
-            raise ConfigurationError(f"objects: points must be at least 3, got {self.points}")
 
     def velocity_variance(self, dt: float) -> tuple[float, float]:
         """Variances of the impulses on the linear [m²/s²] and angular [rad²/s²] velocity over `dt` [s]."""
@@ -191,7 +189,7 @@ class EstimatorModels:
     objects: ObjectModels = field(default_factory=ObjectModels)
 
     def __post_init__(self) -> None:
-        require_positive(self, _RANGES)
+        require_not_negative(self, _RANGES)
         if self.T_world_left is not None:
             try:
                 T = np.array(self.T_world_left, float)
@@ -200,8 +198,6 @@ class EstimatorModels:
             if not is_rigid(T, 1e-6):  # to within the rounding of six digits
                 raise ConfigurationError("T_world_left must be a (4, 4) pose: a rotation and a translation")
             object.__setattr__(self, "T_world_left", tuple(map(tuple, T.tolist())))
-        if self.gate_probability >= 1:
-            raise ConfigurationError(f"gate_probability must lie between 0 and 1, got {self.gate_probability}")
 
     def with_slide(self) -> EstimatorModels:
         """For a back end that models the slide: the noise of pixels is what is left beside it."""

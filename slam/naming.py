@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_UNSHOWN = "\N{REPLACEMENT CHARACTER}"
 _LIKE = 0.6  # least similarity of a suggestion, from 0 to 1
 
 
@@ -19,15 +18,6 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     by_case = {other.lower(): other for other in known}
     near = get_close_matches(str(name).lower(), by_case, 1, _LIKE)
     return by_case[near[0]] if near else None
-
-
-def printable(text: str) -> str:
-    """A text for pictures and pages: control characters and halves of characters are replaced.
-
-    >>> printable("a" + chr(27) + "b")
-    'a�b'
-    """
-    return "".join(letter if letter.isprintable() else _UNSHOWN for letter in text)
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

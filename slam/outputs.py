@@ -21,14 +21,13 @@ _OURS = (("config.json", "frames.csv"), ("sweep.json",))  # what folders of a ru
 
 @dataclass(frozen=True)
 class Output:
-    """A file to be written, or a folder with the files that are written into it."""
+    """A file to be written, or a folder with the files that are written into it; folders above are made."""
 
     path: Path  # of the file or folder
     option: str  # that names it on the command line, for messages
     # of a folder, what is written into it: names or patterns (``*.png``), with a ``/`` at the end those of folders;
     # None for a file
     names: Sequence[str] | None = None
-    makes_folder: bool = False  # the folders above a file are made where they are missing; those of a folder always are
 
     @property
     def real(self) -> Path:
@@ -56,10 +55,9 @@ def require_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = (), over
     if nul := next((output.path for output in outputs if "\0" in str(output.path)), None):
         raise SlamError(f"{nul}: no possible file name")
     read = [Path(os.path.realpath(path)) for path in inputs]
-    made = {output.real for output in outputs if output.names is not None}
     for output in outputs:
         try:
-            _require_place(output, made)
+            _require_place(output)
             filled = output.names is not None and output.path.is_dir() and any(output.path.iterdir())
             for path in [*output.present, *([output.path] if filled else [])]:
                 if any(_is_input(path, file) for file in read):
@@ -85,8 +83,8 @@ def _require_kind(path: Path, folder: bool) -> None:
         raise SlamError(f"{path}: cannot be written: there is something that is not a {kind}")
 
 
-def _require_place(output: Output, made: set[Path]) -> None:
-    """Raise where there is something else, or no folder to write to; `made` are folders that other outputs make."""
+def _require_place(output: Output) -> None:
+    """Raise where there is something else, or nothing can be written."""
     path, exists = output.path, os.path.lexists(output.path)
     if exists:
         path.stat()  # raises for a link to nothing, or in a circle
@@ -95,8 +93,6 @@ def _require_place(output: Output, made: set[Path]) -> None:
             raise PermissionError(13, "Permission denied")
     place = path if output.names is not None and exists else output.real.parent
     above = next(folder for folder in (place, *place.absolute().parents) if os.path.lexists(folder))
-    if above != place and output.names is None and not output.makes_folder and place not in made:
-        raise SlamError(f"{path}: cannot be written: there is no folder {path.parent}")
     with tempfile.TemporaryFile(dir=above):  # permissions alone do not say it
         pass
 

@@ -123,7 +123,11 @@ def create(role: str, name: str, rig: Any, /, **options: Any) -> Any:
         del options["models"]
     try:
         created = made(rig, **options)
-    except SlamError:
+    except SlamError as error:
+        own = list(options_of(made, rig))
+        wrong = next((option for option in options if option not in [*own, "models"]), "")
+        if wrong and own:
+            raise ConfigurationError(f"{what}: {unknown('option', wrong, own)}") from error
         raise
     except (Exception, SystemExit) as error:  # whatever a foreign class does
         known = ", ".join(options_of(made, rig))

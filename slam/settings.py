@@ -24,9 +24,6 @@ SETTABLE: dict[str, tuple[str, ...]] = {
     "surf": ("features", "descriptor", "upright", "min_depth", "max_depth", "threads"),
 }
 
-_LONGEST = 10_000  # characters of a setting
-_BRACKETS = 100  # in its value
-
 
 def apply_settings(tree: dict[str, Any], settings: Sequence[str] | Mapping[str, Any]) -> None:
     """Change leaves of a configuration's tree in place; types and ranges are checked when it is read back.
@@ -41,8 +38,6 @@ def apply_settings(tree: dict[str, Any], settings: Sequence[str] | Mapping[str, 
     if not isinstance(settings, (list, tuple)) or not all(isinstance(setting, str) for setting in settings):
         raise ConfigurationError("settings must be a list of texts section.key=value, or a dict of values by key")
     for setting in settings:
-        if len(setting) > _LONGEST:
-            raise ConfigurationError(f"setting {setting!r} is longer than {_LONGEST} characters")
         path, equals, text = setting.partition("=")
         if not equals:
             raise ConfigurationError(f"setting {setting!r} is not of the form section.key=value")
@@ -71,8 +66,6 @@ def require_settable(settings: Iterable[str], tree: Mapping[str, Any], frontend:
 
 def _value(text: str) -> Any:
     """The parsed value if the text is JSON, else the text; too deep nesting or too many digits count as no JSON."""
-    if text.count("[") + text.count("{") > _BRACKETS:
-        return text
     try:
         return json.loads(text)
     except (ValueError, RecursionError):

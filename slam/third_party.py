@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from numbers import Real
-from traceback import walk_tb
 from typing import Any
 
 import numpy as np
 
 from slam.checks import LATEST_STAMP, is_rigid
 from slam.data import Estimate, Patches, Prediction, UpdateReport, UpdateStatus
-from slam.errors import PartError, SlamError, cause, text_of
+from slam.errors import AnswerError, PartError, SlamError, cause
 
 _OURS = ("slam", "backends", "frontends", "builtins")
 
@@ -28,7 +27,6 @@ _ANSWERS: dict[str, tuple[type, dict[str, Any]]] = {
     "patches": (Patches, {"images": ("n", "s", "s"), "centres": ("n", 2), "size": ("n",)}),
     "align": (tuple, {}),
 }
-_DATA = (Prediction, UpdateReport, Estimate, Patches)
 _IDS, _FINITE = ("ids", "used", "rejected"), ("T_world_left", "covariance", "positions", "covariances", "real")
 _COVARIANCES = ("covariance", "covariances", "innovation")
 
@@ -36,13 +34,12 @@ _COVARIANCES = ("covariance", "covariances", "innovation")
 def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
     """What a method of a back end or front end answered, checked; a step does that with every answer, so it is cheap.
 
-    `sizes` of the arrays, by the letters of `_ANSWERS`, are those that are known. Raises SlamError where it is of
+    `sizes` of the arrays, by the letters of `_ANSWERS`, are those that are known. Raises AnswerError where it is of
     another type than documented, an array of another shape, a pose or position not finite, or a variance negative.
     """
     what, (kind, attributes) = f"{type(owner).__name__}.{method}", _ANSWERS[method]
     if not isinstance(answer, kind):
-        hint = f" (see slam.{kind.__module__.removeprefix('slam.')}.{kind.__name__})" if kind in _DATA else ""
-        raise SlamError(f"{what}: must be of type {kind.__name__}, got {type(answer).__name__}{hint}")
+        raise AnswerError(f"{what}: must be of type {kind.__name__}, got {type(answer).__name__}")
     for name, wanted in attributes.items():
         value, where = getattr(answer, name), what if name == "real" else f"{what}: {name}"
         if isinstance(wanted, tuple):
@@ -54,50 +51,34 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
             expected = tuple(map(sizes.get, wanted, wanted))
             if not numeric or shape != expected:
                 got = f"{value.dtype} {shape}" if isinstance(value, np.ndarray) else type(value).__name__
-                raise SlamError(f"{where} must be an array {expected} of numbers, got {got}".replace("'", ""))
+                raise AnswerError(f"{where} must be an array {expected} of numbers, got {got}".replace("'", ""))
             if name in _IDS and value.dtype.kind not in "iu":
-                raise SlamError(f"{where} must be an array of ids, got {value.dtype}")
+                raise AnswerError(f"{where} must be an array of ids, got {value.dtype}")
             if name in _FINITE and not np.isfinite(value).all():
-                raise SlamError(f"{where} is not finite")
+                raise AnswerError(f"{where} is not finite")
             if name == "T_world_left" and not is_rigid(value, 1e-3):
-                raise SlamError(f"{where} is no rotation and translation")
+                raise AnswerError(f"{where} is no rotation and translation")
             if name in _COVARIANCES and (value.diagonal(0, -2, -1) < -1e-9).any():  # 1e-9: rounding
-                raise SlamError(f"{where} has a negative variance")
+                raise AnswerError(f"{where} has a negative variance")
         elif not isinstance(value, wanted):
-            raise SlamError(f"{where} must be of type {wanted.__name__}, got {type(value).__name__}")
+            raise AnswerError(f"{where} must be of type {wanted.__name__}, got {type(value).__name__}")
         elif name == "stamp" and not abs(value) <= LATEST_STAMP:
-            raise SlamError(f"{where} must be within {LATEST_STAMP:g} s")
+            raise AnswerError(f"{where} must be within {LATEST_STAMP:g} s")
     return answer
 
 
 @contextmanager
 def named_failures(place: str, *parts: object) -> Iterator[None]:
-    """Turn exceptions that a third-party part raised, or that its return values may have caused, into `PartError`.
+    """Turn exceptions that a third-party part raised, or that its return values have caused, into `PartError`.
 
     If all parts are our own, exceptions pass unchanged. `place` is the present operation, for the message.
     """
-    foreign = [part for part in parts if type(part).__module__.partition(".")[0] not in _OURS]
+    foreign = [type(part).__name__ for part in parts if type(part).__module__.partition(".")[0] not in _OURS]
     try:
         yield
-    except SlamError as error:
-        if any(str(error).startswith(f"{type(part).__name__}.") for part in foreign):  # an answer that was `checked`
-            raise SlamError(f"{place}: {error}") from error
-        raise
-    except (Exception, SystemExit) as error:  # whatever a third-party class does
-        *_, (last, _) = walk_tb(error.__traceback__)
-        by_part = last.f_globals.get("__name__") in [type(part).__module__ for part in foreign]
-        if not foreign or (isinstance(error, SystemExit) and not by_part):  # as of a signal handler elsewhere
+    except AnswerError as error:
+        raise SlamError(f"{place}: {error}") from error
+    except Exception as error:  # whatever a third-party class does
+        if not foreign or isinstance(error, SlamError):
             raise
-        part, call = next(((part, f".{call}") for part in foreign if (call := _call(error, part))), (foreign[0], ""))
-        failed = "failed" if call else "may have failed"  # what it answered may have broken something of ours
-        raise PartError(f"{place}: {type(part).__name__}{call} {failed}: {cause(error)}") from error
-
-
-def _call(error: BaseException, part: object) -> str:
-    """The method of `part` that raised an exception, or was called wrongly; empty for none."""
-    for frame, _ in walk_tb(error.__traceback__):
-        first, name = frame.f_code.co_varnames[:1], frame.f_code.co_name
-        if first and frame.f_locals.get(first[0]) is part and hasattr(part, name):
-            return name
-    name, dot, rest = text_of(error).partition(".")
-    return rest.partition("(")[0] if dot and isinstance(error, TypeError) and name == type(part).__qualname__ else ""
+        raise PartError(f"{place}: {' or '.join(foreign)} failed: {cause(error)}") from error

@@ -8,7 +8,7 @@ from typing import Any
 from backends.ekf.filter import LandmarkFilter
 from backends.ekf.landmarks import COORDINATES
 from backends.ekf.motion import EulerCamera
-from slam.bounds import from_options, require_positive
+from slam.bounds import from_options, require_not_negative
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels, SlideModel
@@ -23,8 +23,7 @@ class EkfConfig:
     Attributes:
         papers: closest to the papers' filter: the left pixel alone, one linearisation, landmarks in the world, a
             covariance that is not transported, features that do not slide. No other option may be set then. What
-            stays is the gate by what all others predict, the outlier test, the recovery, and the limit of 300 landmarks
-            in the state.
+            stays is the gate by what all others predict, the outlier test, and the recovery.
         measurement: ``"stereo"`` measures (uL, vL, uR), ``"left"`` the left pixel alone, as the papers do (paper A, V).
         iterations: most linearisations in an update; 1 is the papers' filter (paper A, Eq. 11). More are made only in
             updates where the first is not linear to within the noise.
@@ -44,7 +43,7 @@ class EkfConfig:
     consistent: bool = True
 
     def __post_init__(self) -> None:
-        require_positive(self, {"iterations": (1, 1000)}, "ekf")
+        require_not_negative(self, {"iterations": (1, 1000)}, "ekf")
         if self.papers and replace(self, papers=False) != EkfConfig():
             raise ConfigurationError("ekf: papers=true chooses the other options itself; leave them out")
         for name, known in (("measurement", MEASUREMENTS), ("landmarks", tuple(COORDINATES))):

@@ -27,7 +27,7 @@ from backends.ekf.camera import prior
 from backends.ekf.covariance import CAMERA, POSE
 from backends.ekf.filter import LandmarkFilter
 from backends.ekf.landmarks import InverseDepth
-from slam.bounds import from_options, require_positive
+from slam.bounds import from_options, require_not_negative
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, hat
@@ -118,7 +118,7 @@ class IekfConfig:
     iterations: int = 20
 
     def __post_init__(self) -> None:
-        require_positive(self, {"iterations": (1, 1000)}, "iekf")
+        require_not_negative(self, {"iterations": (1, 1000)}, "iekf")
 
 
 class IekfBackend(LandmarkFilter):

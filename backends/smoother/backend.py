@@ -12,7 +12,7 @@ from backends.smoother.config import SmootherConfig
 from backends.smoother.factors import FactorMaker
 from backends.smoother.graph import Graph
 from backends.smoother.mending import corrected, rebuilt
-from backends.smoother.path import Path
+from backends.smoother.path import Path, recent
 from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
 from slam.bounds import from_options
@@ -41,7 +41,7 @@ class SmootherBackend:
 
     Attributes:
         state: all that is kept: poses, measurements, landmarks.
-        path: how the frames hang at the poses of the graph.
+        path: all poses.
         factor_maker: makes factors with this back end's rig and models.
 
     Raises:
@@ -77,11 +77,11 @@ class SmootherBackend:
 
     def _predict(self, stamp: float, rests: bool) -> Prediction:
         s = self.state
-        require_stamp("smoother", stamp, float(s.stamps[1]) if s.started else None)
+        require_stamp("smoother", stamp, float(s.stamps[-1]) if s.started else None)
         s = self._steps.predicted(s, float(stamp), rests)
         rows, left, right, S = self._steps.in_view(s)
-        found = Prediction(float(stamp), s.last[1].copy(), s.covariance, s.landmarks.ids[rows], left, right, S)
-        self.path.extend(s)
+        found = Prediction(float(stamp), s.poses[-1].copy(), s.spread[-1].copy(), s.landmarks.ids[rows], left, right, S)
+        self.path.follow(s)
         self.state = s
         return found
 
@@ -117,9 +117,8 @@ class SmootherBackend:
         marks = s.landmarks
         rows = marks.order if landmarks else marks.order[:0]
         covariances = self._steps.landmark_covariances(s, self._graph, rows) if len(rows) else np.zeros((0, 3, 3))
-        return Estimate(
-            float(s.stamps[1]), s.last[1].copy(), s.covariance, marks.ids[rows], marks.position[rows], covariances
-        )
+        T, P = s.poses[-1].copy(), s.spread[-1].copy()
+        return Estimate(float(s.stamps[-1]), T, P, marks.ids[rows], marks.position[rows], covariances)
 
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`."""
@@ -129,12 +128,12 @@ class SmootherBackend:
     @one_blas_thread
     def recent(self, n: int) -> RecentPoses:
         """The last camera poses, at most n and as many as are in the graph, with their joint covariance."""
-        return self.path.recent(self._started("recent"), self._graph, require_recent("smoother", n))
+        return recent(self._started("recent"), self._graph, require_recent("smoother", n))
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: poses that have left the lag are final."""
-        return self.path.trajectory(self.state)
+        return self.path.trajectory()
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
@@ -172,7 +171,8 @@ class SmootherBackend:
     @property
     def revises_path(self) -> bool:
         """See `slam.interfaces.RevisingBackend`: True while the first pose has not left the lag."""
-        return self._graph.oldest(self.state) == 0
+        s = self.state
+        return not s.started or s.oldest(self.config.lag, s.number) == 0
 
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:

@@ -46,7 +46,7 @@ class FactorMaker:
 
     def __init__(self, stereo: RectifiedStereo, models: EstimatorModels) -> None:
         self.sigma = models.pixel_sigma
-        self.stereo, self._models = stereo, models
+        self.stereo, self.models = stereo, models
         self._K = gtsam.Cal3_S2Stereo(stereo.f, stereo.f, 0.0, stereo.u0, stereo.v0, stereo.baseline)
         self._noise = gtsam.noiseModel.Isotropic.Sigma(3, self.sigma)
         self._quick = _parameters(gtsam.LinearizationMode.HESSIAN)
@@ -61,18 +61,17 @@ class FactorMaker:
         """A pose is T (4, 4) with a covariance (6, 6)."""
         return gtsam.PriorFactorPose3(pose_key(pose), to_pose3(T), gtsam.noiseModel.Gaussian.Covariance(covariance))
 
-    def tie(self, earlier: int, later: int, relative: Array, covariance: Array) -> gtsam.NonlinearFactor:
-        """A pose relative to an earlier one, as the motion model predicts it: (4, 4), covariance (6, 6)."""
-        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    def tie(self, earlier: int, later: int, relative: Array, sigmas: float | Array) -> gtsam.NonlinearFactor:
+        """A pose relative to an earlier one (4, 4), with standard deviations (6,) [rad], [m]."""
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.broadcast_to(sigmas, 6))
         return gtsam.BetweenFactorPose3(pose_key(earlier), pose_key(later), to_pose3(relative), noise)
 
-    def motion(self, keys: Sequence[int], dt: Array, over: float | None = None) -> gtsam.NonlinearFactor:
+    def motion(self, keys: Sequence[int], dt: Array) -> gtsam.NonlinearFactor:
         """The velocity between the last two poses is that before but for noise.
 
         gtsam linearises it where it linearises the rest: at other poses it would pull at the path as a whole, which
         nothing else holds. `keys` are three successive poses with the times `dt` (2,) [s] between them; or two of which
-        the first velocity is unknown, and then the first time does not count. `over` is the time [s] over which the
-        velocity changed; None for the last one of these.
+        the first velocity is unknown, and then the first time does not count.
         """
         n, before, last = len(keys), float(dt[0]), float(dt[1])
 
@@ -83,7 +82,7 @@ class FactorMaker:
                     jacobians[i] = J[:, 6 * (i + 3 - n) : 6 * (i + 4 - n)]
             return r
 
-        sigmas = velocity_sigmas(self._models, last if over is None else over, n == 2)
+        sigmas = velocity_sigmas(self.models, last, n == 2)
         return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Sigmas(sigmas), keys, error)
 
     def point(self, z: Sequence[float]) -> gtsam.StereoPoint2:

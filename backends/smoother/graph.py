@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key
-from backends.smoother.state import SmootherState, Tie, follows
+from backends.smoother.state import SmootherState
 from backends.smoother.tracks import GraphProblem, Stamps, Tracks
 from slam.data import IdArray
 from slam.errors import SlamError
@@ -43,7 +43,7 @@ class Solved:
     serials: IdArray  # of landmarks that are variables (V,)
     points: Array  # and where they are (V, 3)
     linearised: Array  # and where they are linearised (V, 3)
-    covariance: Array  # joint covariance (12, 12) of the last two poses; (6, 6) of a single one
+    covariance: Array  # joint covariance of the anchor, or the oldest pose, the last but one, and the last (18, 18)
     spread: Array  # covariances (N, 6, 6) of those that are new
 
 
@@ -84,7 +84,6 @@ class Graph:
         self._first = np.eye(4)  # the first pose
         self._to_state = np.eye(4)  # takes gtsam's coordinates to the state's
         self._kind = False, 0
-        self._tie: Tie | None = None  # of its newest pose
 
     def followed(self, s: SmootherState) -> tuple[Solved, str]:
         """The solution for a state with more poses than the last one; and why gtsam failed, if it did.
@@ -108,7 +107,7 @@ class Graph:
     def rebuilt(self, s: SmootherState, again: int = 0) -> Solved:
         """The solution with all anew, linearised `again` so many times more; SolverError where gtsam fails."""
         self.restart()
-        oldest, self._careful = self.oldest(s), max(self._careful, s.number + 1)
+        oldest, self._careful = s.oldest(self._lag, s.number), max(self._careful, s.number + 1)
         self._kind, self._first = _kind(s), s.poses[s.of(oldest)]
         prior, self._base = held(s, oldest)
         begin = GraphProblem()
@@ -120,15 +119,10 @@ class Graph:
         self._to_state, self._first = M @ self._to_state, M @ self._first
         self._poses = {number: M @ T for number, T in self._poses.items()}
 
-    def oldest(self, s: SmootherState, newest: int | None = None) -> int:
-        """Number of the oldest pose in the graph, where the newest one is that of the state, or has another number."""
-        least = max(s.begun, s.first)
-        return least if self._lag is None else max(least, (s.number if newest is None else newest) - self._lag)
-
     def _update(self, s: SmootherState, numbers: range, problem: GraphProblem, again: int = 0) -> Solved:
         """The solution after a problem, and some poses with what was measured from them; solved `again` so often."""
-        oldest, before = self.oldest(s), numbers.start - 1
-        first = min(oldest, before) if self._poses else oldest  # more than a lag of poses may have entered
+        oldest, before = s.oldest(self._lag, s.number), numbers.start - 1
+        first = min(oldest, before) if self._poses else oldest  # more than a lag of poses may have seen nothing
         for number in numbers:
             if number > first:
                 self._tracks.add_rows(problem, s, number - 1, first, self._taken)
@@ -139,7 +133,7 @@ class Graph:
         made = self._tracks.make_smart(problem, s.number < self._careful)
         # Two steps of Gauss and Newton: in the first, nothing leaves. What leaves fixes where its neighbours stay
         # linearised, and that is to be after the newest pose is solved for.
-        now: Stamps = dict.fromkeys(problem.values.keys(), float(before))
+        now: Stamps = dict.fromkeys(problem.values.keys(), float(s.ages[s.of(numbers.start)] - 1))
         with solving():
             self._solver.update(problem.factors, problem.values, now, problem.removed)
             slots = self._solver.getISAM2Result().getNewFactorsIndices()
@@ -149,7 +143,7 @@ class Graph:
             values = self._solver.calculateEstimate()
         for track, place in made:
             track.slot = slots[place]
-        self._tracks.forget(s)
+        self._tracks.forget(s, oldest)
         new = [i for i in numbers if i >= oldest] if self._poses else [s.number]
         poses = self._to_state @ [values.atPose3(pose_key(i)).matrix() for i in range(oldest, s.number + 1)]
         self._poses = dict(zip(range(oldest, s.number + 1), poses))
@@ -157,32 +151,31 @@ class Graph:
             transform(self._to_state, np.array([v.atPoint3(landmark_key(n)) for n in kept]).reshape(-1, 3))
             for v in (values, self._solver.getLinearizationPoint() if kept else values)
         )
-        joint = self._joint(list(range(max(oldest, s.number - 1), s.number + 1)))
+        joint = self._joint([max(oldest, i) for i in (s.anchor, s.number - 1, s.number)])
         spread = np.array([*(self._joint([i]) for i in new[:-1]), joint[-6:, -6:]])
         if not (np.isfinite(poses).all() and np.isfinite(joint).all() and (np.diag(joint) > 0).all()):
             raise SolverError("gtsam: the solution is not finite, or a variance not positive")
-        self.number, self._tie = s.number, s.ties[s.of(s.number)]
+        self.number = s.number
         return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, joint, spread)
 
-    def joint_covariance(self, s: SmootherState, first: int | None = None) -> tuple[int, Array]:
-        """Number of the first pose, and the joint covariance (6 K, 6 K) of all poses from there on.
+    def joint_covariance(self, s: SmootherState, first: int, last: int) -> tuple[int, Array]:
+        """Number of the first pose, and the joint covariance (6 K, 6 K) of the poses from there to the `last`.
 
-        From `first` on, or the oldest in the graph; of the newest pose alone, if the graph is not the state's. Poses
-        that entered since are as uncertain as their ties, relative to the graph's newest; where there are more of them
-        than a lag, the last two lags are all.
+        From `first` on, or the oldest in the graph; of the last pose alone, if the graph is not the state's. Poses that
+        nothing was measured from since follow from the motion model.
         """
         if not self._is_of(s):
-            return s.number, s.spread[-1]
-        oldest = self.oldest(s, max(self.number, s.number - (self._lag or 0)))
-        first = oldest if first is None else max(oldest, first)
-        begin = min(first, self.number)
-        P = self._joint(list(range(begin, self.number + 1)))
-        for tie in s.ties[s.of(self.number) + 1 :]:
-            assert tie is not None  # only the pose with which the problem begins has none
-            gain, rest = follows(adjoint(inverse(tie.relative)), P[-6:, -6:], tie.shared, tie.covariance)
-            cross = gain @ P[-6:]
-            P = np.block([[P, cross.T], [cross, cross[:, -6:] @ gain.T + rest]])
-        return first, P[6 * (first - begin) :, 6 * (first - begin) :]
+            return last, s.spread[s.of(last)]
+        solved, begin = self.number, s.oldest(self._lag, self.number)
+        begin, first = max(begin, min(first, solved - 1)), max(begin, first)
+        P = self._joint(list(range(begin, solved + 1)))
+        for number in range(solved + 1, last + 1):
+            _, J, noise, _ = s.moved(self._make.models, number)
+            J = J[:, -len(P) :]
+            cross = J @ P[-J.shape[1] :]
+            P = np.block([[P, cross.T], [cross, cross[:, -J.shape[1] :] @ J.T + noise]])
+        rows = slice(6 * (first - begin), 6 * (last + 1 - begin))
+        return first, P[rows, rows]
 
     def landmark_covariance(self, s: SmootherState, serial: int, position: Array) -> Array | None:
         """Covariance (3, 3) in the world of a landmark at a position (3,), if it is a variable of the state's graph."""
@@ -195,20 +188,18 @@ class Graph:
         return np.asarray(R @ self._solver.getISAM2().marginalCovariance(key) @ R.T + J @ self._base @ J.T)
 
     def _is_of(self, s: SmootherState) -> bool:
-        """Whether it is the state's graph, up to poses that entered since the last update.
-
-        A pose of that number may be another frame, if the call that had added it was interrupted.
-        """
-        known = max(s.begun, s.first) <= self.number <= s.number
-        return known and self._kind == _kind(s) and self._tie is s.ties[s.of(self.number)]
+        """Whether it is the state's graph, up to poses since the last update; not if that was interrupted."""
+        return self.number == s.solved >= max(s.begun, s.first) and self._kind == _kind(s)
 
     def _joint(self, numbers: list[int]) -> Array:
-        keys = [pose_key(i) for i in numbers]
+        each, at = np.unique(numbers, return_inverse=True)
+        keys = [pose_key(i) for i in each.tolist()]
         with solving():
             isam = self._solver.getISAM2()
             P = isam.marginalCovariance(keys[0]) if len(keys) == 1 else isam.jointMarginalCovariance(keys).fullMatrix()
+        again = (6 * at[:, None] + np.arange(6)).ravel()
         A = adjoint(inverse(np.array([self._poses[i] for i in numbers])) @ self._first).reshape(-1, 6)
-        P = P + A @ self._base @ A.T
+        P = P[again[:, None], again] + A @ self._base @ A.T
         return np.asarray(0.5 * (P + P.T))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import invert_symmetric, multiply, trace
+from slam.kernels.linear import assign, invert_symmetric, multiply, trace
 from slam.kernels.se3 import transform_back
 from slam.kernels.stereo import by_point, residual
 from slam.kernels.velocities import velocity_change
@@ -65,7 +65,8 @@ def refine(camera, poses, frames, z, sigma, mean, information, points, own):
         if frames[m].max() < 0:
             continue
         damping, cost = 0.0, np.inf
-        x[:] = points[m]
+        for i in range(3):
+            x[i] = points[m, i]
         for iteration in range(_STEPS + 1):
             there = 0.0
             for i in range(3):
@@ -79,10 +80,12 @@ def refine(camera, poses, frames, z, sigma, mean, information, points, own):
                     there += add_information(camera, poses[frames[m, k]], z[m, k], x, weight, H_there, g_there, work)
             if there < cost or not iteration:
                 cost, damping = there, 0.1 * damping
-                points[m], H[:], g[:] = x, H_there, g_there
+                assign(H_there, H)
+                for i in range(3):
+                    points[m, i], g[i] = x[i], g_there[i]
             else:
                 damping = max(10 * damping, _DAMPING)
-            A[:] = H
+            assign(H, A)
             for i in range(3):
                 A[i, i] *= 1 + damping
             invert_symmetric(A, _FREE * (1 + trace(A)), inverse)
@@ -115,7 +118,9 @@ def carried_by(camera, poses, width, frames, z, sigma, points, older, own):
                 place = max(frames[m, k] - first, 0)
                 oldest = min(oldest, place)
                 add_information(camera, poses[frames[m, k]], z[m, k], points[m], weight, share[place], g, work)
-        share[oldest] += older[m]
+        for i in range(3):
+            for j in range(3):
+                share[oldest, i, j] += older[m, i, j]
         for w in range(width):
             T = poses[first + w]
             multiply(own[m], share[w], C)

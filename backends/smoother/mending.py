@@ -31,7 +31,7 @@ def corrected(s: SmootherState, correct: Callable[[Array], Array]) -> SmootherSt
 
 def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     """The last poses after a correction: the newest one stays where it is, the others and the landmarks move."""
-    first = graph.oldest(s)
+    first = s.oldest(steps.config.lag, s.number)
     now, spread, start = s.poses[s.of(first) :], s.spread, s.start
     with suppress(SolverError):  # then the next update tries again
         solved = graph.rebuilt(s, _AGAIN)
@@ -44,13 +44,9 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
             start = M @ start
     D = now[0] @ inverse(s.poses[s.of(first)])
     moved = np.concatenate([D @ s.poses[: s.of(first)], now])
-    marks, last = s.landmarks, s.last.copy()
+    marks = s.landmarks
     unseen = ~marks.world & ~(marks.pose >= first).any(axis=1)
     position = np.where(unseen[:, None], transform(D, marks.position), marks.position)
     marks = replace(marks, position=position, mean=np.where(unseen[:, None], position, marks.mean))
-    if s.anchored:
-        last[1] = moved[-1] @ inverse(s.poses[-1]) @ s.last[1]
-    at = -2 if s.inside and len(moved) > 1 else -1  # the pose at which the last frame but one hangs
-    last[0] = moved[at] @ inverse(s.poses[at]) @ s.last[0]
     marks = marks.refined(steps.stereo, steps.models.pixel_sigma, s.first, moved)
-    return replace(s, poses=moved, last=last, landmarks=marks, spread=spread, start=start)
+    return replace(s, poses=moved, landmarks=marks, spread=spread, start=start, solved=graph.number)

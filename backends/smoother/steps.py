@@ -14,16 +14,16 @@ import numpy as np
 from backends.smoother.config import SmootherConfig
 from backends.smoother.graph import Graph, Solved, SolverError
 from backends.smoother.landmarks import VARIABLE, SmootherLandmarks, inverses
-from backends.smoother.state import Known, Sight, SmootherState, Tie
+from backends.smoother.state import Known, Sight, SmootherState
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
-from slam.geometry.se3 import Array, adjoint, exp, inverse, log, points_by_pose, rotation_angle, transform
-from slam.window import motion, pose_only
+from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
+from slam.window import pose_only
 from slam.window.consensus import landmarks_pose
 from slam.window.gating import MIN_CONSENSUS
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.stereo import RectifiedMeasurement, relative_covariance
 
-_SURE = 3.0  # guard: deviations of a turn in frames that saw nothing; half a turn and more looks like another one
+_ALONE: tuple[Array, Array] = np.zeros((12, 12)), np.zeros((6, 12))  # `pair` and `shared` of a first pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,34 +40,38 @@ class Steps(RectifiedMeasurement):
     # --- prediction ---
 
     def predicted(self, s: SmootherState, stamp: float, rests: bool = False) -> SmootherState:
-        """With the newest frame at `stamp` [s], by the motion model. The very first one is a pose of the graph."""
+        """With the newest frame at `stamp` [s], by the motion model."""
+        s = replace(
+            s, stamps=np.append(s.stamps, stamp), rests=np.append(s.rests, rests),
+            sights=(*s.sights, Sight.none()), measured=False,
+        )  # fmt: skip
         if not s.started:
             T = self.models.initial_pose
             sigmas = np.repeat([self.models.initial_rotation_sigma, self.models.initial_position_sigma], 3)
-            s = replace(s, stamps=np.array([np.nan, stamp]), last=np.stack([T, T]), frame=0)
-            return _begun(s, T, np.diag(sigmas**2), Sight.none())
-        dt = min(stamp - s.stamps[1], motion.LONGEST)
-        before = None if s.since == 0 else min(s.stamps[1] - s.stamps[0], motion.LONGEST)
-        T, J, noise, first = motion.predicted(self.models, s.last, before, dt, rests)
+            P: Array = np.diag(sigmas**2)
+            return _begun(replace(s, poses=T[None], spread=P[None], ages=np.zeros(1, np.intp)), T, P)
+        s = replace(s, poses=np.concatenate([s.poses, s.poses[-1:]]), ages=np.append(s.ages, s.ages[-1]))
+        T, J, noise, _ = s.moved(self.models, s.number)
         cross = J @ s.pair[:, 6:]
         own = _carried(J, s.pair) + noise
         own = 0.5 * (own + own.T)
+        shared, at = s.shared @ J.T, s.of(s.anchor)
+        # It moves as the last poses did, so what it is off by relative to the anchor has to do with that one's error.
+        A = np.concatenate([adjoint(inverse(T) @ s.poses[at]), np.eye(6)], axis=1)
+        P = _carried(A, np.block([[s.spread[at], shared], [shared.T, own]]))
         return replace(
-            s, stamps=np.array([s.stamps[1], stamp]), last=np.stack([s.last[1], T]), frame=s.frame + 1,
-            pair=np.block([[s.own, cross.T], [cross, own]]),
-            shared=np.concatenate([s.shared[:, 6:], s.shared @ J.T], axis=1),
-            by_rig=np.concatenate([s.by_rig[6:], J @ s.by_rig]), since=s.since + 1, inside=False, measured=False,
-            follows_pose=s.inside,
-            tie=_tie(s, inverse(s.poses[-1]) @ T, own, s.shared @ J.T, dt, first, rests),
+            s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread, 0.5 * (P + P.T)[None]]),
+            pair=np.block([[s.own, cross.T], [cross, own]]), shared=np.concatenate([s.shared[:, 6:], shared], axis=1),
+            by_rig=np.concatenate([s.by_rig[6:], J @ s.by_rig]),
         )  # fmt: skip
 
     def in_view(self, s: SmootherState) -> tuple[IndexArray, Array, Array, Array]:
         """Landmarks in the angle of view (paper A, Fig. 3), their pixels, and innovation covariances (M, 2, 2)."""
-        T, marks, rows = s.last[1], s.landmarks, s.landmarks.order
+        T, marks, rows = s.poses[-1], s.landmarks, s.landmarks.order
         rows = rows[self.visible(T, marks.position[rows])]
         local, own = pose_only.seen_from(T, marks.position[rows], marks.from_newest[rows])
         by_pose = points_by_pose(local)
-        by_motion = np.where(marks.world[rows, None, None], s.covariance, s.own)
+        by_motion = np.where(marks.world[rows, None, None], s.spread[-1], s.own)
         C = own + by_pose @ by_motion @ np.swapaxes(by_pose, 1, 2)
         return rows, *self.pixels(local, C)
 
@@ -82,8 +86,9 @@ class Steps(RectifiedMeasurement):
             return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
         try:
             one = self._problem(s, rows, z)
-            R, start = s.poses[-1][:3, :3], one.predicted if guess is None else guess
-            lost = len(s.sights[-1]) >= MIN_CONSENSUS and unknown_turn(R @ s.spread[-1][:3, :3] @ R.T - s.turned)
+            at, start = s.of(s.anchor), one.predicted if guess is None else guess
+            R = s.poses[at, :3, :3]
+            lost = len(s.sights[at]) >= MIN_CONSENSUS and unknown_turn(R @ s.spread[at, :3, :3] @ R.T - s.turned)
             found = agreement(
                 one, start, lambda: landmarks_pose(self, one.points, z, one.predicted, s.number), s.contradicted, lost
             )
@@ -99,10 +104,10 @@ class Steps(RectifiedMeasurement):
 
     def _problem(self, s: SmootherState, rows: IndexArray, z: Array) -> pose_only.PoseProblem:
         """The newest pose alone, with the motion model as its prior, and landmarks as they stand."""
-        T, marks = s.last[1], s.landmarks
+        T, marks = s.poses[-1], s.landmarks
         local, own = pose_only.seen_from(T, marks.position[rows], marks.from_newest[rows])
         noise = pose_only.residual_noise(self.stereo, self.models.pixel_sigma, local, own, z)
-        P = s.covariance if s.inside or marks.world[rows].any() else s.own
+        P = s.spread[-1] if s.anchor == s.number or marks.world[rows].any() else s.own
         probability = self.models.gate_probability
         return pose_only.PoseProblem(self.stereo, marks.position[rows], z, noise, T, np.linalg.inv(P), probability)
 
@@ -111,13 +116,9 @@ class Steps(RectifiedMeasurement):
     ) -> tuple[SmootherState, float, str]:
         """The state after an update, its NIS, and why gtsam failed, if it did."""
         used, marks = found.used, s.landmarks
-        seen, number = rows[used], s.number + (found.jump is not None or not s.inside)
+        seen, number = rows[used], s.number
         if found.jump is not None:
-            marks = marks.without_measurements(np.ones(len(marks), bool)).measured(seen, z[used], number, self.track)
-            after = _begun(s, found.T, world_covariance(s.covariance), Sight.of(marks, seen, z[used]))
-            known = {serial: one for serial, one in s.known.items() if one.pose < 0}
-            after = replace(after, known=known, landmarks=marks)
-            return self.settled(after, graph.rebuilt(after)), float("nan"), ""
+            return self._anew(s, graph, found.T, world_covariance(s.spread[-1]), seen, z[used])
         one = replace(one, points=one.points[used], z=z[used], noise=one.noise[used])
         field, before = self.field(one.z), marks.by_rig[seen]
         G, F = _by_pose_and_rig(one, found.T, before, field)
@@ -127,49 +128,56 @@ class Steps(RectifiedMeasurement):
         marks = replace(marks, by_rig=marks.by_rig.copy())
         own = marks.from_newest[seen]
         marks.by_rig[seen] = _landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
+        if unknown_turn(s.own):
+            P = np.linalg.inv(one.information + G.T @ G)
+            at = s.of(s.anchor)
+            A = adjoint(inverse(found.T) @ s.poses[at])
+            P = world_covariance(s.spread[-1]) if marks.world[seen].any() else A @ s.spread[at] @ A.T + P
+            return self._anew(s, graph, found.T, P, seen, z[used])
         linear = math.sqrt(self.stereo.f / self.models.pixel_sigma)
         marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T, linear)
-        marks = marks.measured(seen, z[used], number, self.track, graph.oldest(s, number), graph.number)
-        sight = Sight.of(marks, seen, z[used])
-        if s.inside:  # the very first frame, in a map that is known
-            after = replace(
-                s, sights=(*s.sights[:-1], sight), poses=np.concatenate([s.poses[:-1], found.T[None]]),
-                last=np.stack([s.last[0], found.T]), landmarks=marks, by_rig=np.concatenate([s.by_rig[:6], by_rig]),
-            )  # fmt: skip
-            return self.settled(after, graph.rebuilt(after)), nis, ""
-        after = replace(_joined(_smoothed(s, found.T, G.T @ G, by_rig), sight), landmarks=marks)
+        marks = marks.measured(seen, z[used], number, self.track, s.oldest(self.config.lag, number), graph.number)
+        before_by_rig = s.by_rig[:6]
+        if number > s.begun:
+            before_by_rig = before_by_rig + s.pair[:6, 6:] @ np.linalg.solve(s.own, by_rig - s.by_rig[6:])
+        after = replace(
+            _seeing(s), sights=(*s.sights[:-1], Sight.of(marks, seen, z[used])), landmarks=marks,
+            poses=np.concatenate([s.poses[:-1], found.T[None]]),
+            by_rig=np.concatenate([before_by_rig, by_rig]),
+        )  # fmt: skip
         solved, why = graph.followed(after)
+        drift = _drift(s, solved)
         after = self.settled(after, solved)
-        drift = _drift(solved.covariance, after.poses[-2], after.poses[-1])
         marks = after.landmarks.without_variables(number) if why else after.landmarks
         return replace(after, landmarks=marks.left_behind(seen, after.poses[-1], drift)), nis, why
 
+    def _anew(
+        self, s: SmootherState, graph: Graph, T: Array, P: Array, seen: IndexArray, z: Array
+    ) -> tuple[SmootherState, float, str]:
+        """As `_corrected`, with the newest pose, at T (4, 4) with a covariance P (6, 6), as the first of a problem."""
+        s = _begun(_seeing(s), T, P)
+        marks = s.landmarks.measured(seen, z, s.number, self.track)
+        s = replace(s, sights=(*s.sights[:-1], Sight.of(marks, seen, z)), landmarks=marks)
+        return self.settled(s, graph.rebuilt(s)), float("nan"), ""
+
     def settled(self, s: SmootherState, solved: Solved) -> SmootherState:
-        """The state with what the graph says: the newest frame is a pose of it."""
+        """The state with what the graph says: the newest pose is the anchor."""
         poses = np.concatenate([s.poses[: s.of(solved.first)], solved.poses])
-        P, last = solved.covariance, s.last.copy()
-        pair: Array = np.zeros((12, 12))
-        shared: Array = np.zeros((6, 12))
-        if s.since:
-            newest_first = np.roll(s.pair, 6, (0, 1))
-            if len(P) == 12 and s.follows_pose:
-                newest_first, last[0] = np.roll(P, 6, (0, 1)), poses[-2]
-            else:
-                last[0] = poses[-1] @ inverse(s.last[1]) @ s.last[0]
-            pair, shared = _before(newest_first, poses[-1], last[0])
-        last[1] = poses[-1]
+        pair, shared = _ALONE
+        if s.number > s.begun:
+            pair, shared = _before(np.roll(solved.covariance[6:, 6:], 6, (0, 1)), poses[-2:])
         spread = np.concatenate([s.spread[: -len(solved.spread)], solved.spread])
         marks = s.landmarks.refined(self.stereo, self.models.pixel_sigma, s.first, poses)
         marks = marks.solved(solved.serials, solved.points, solved.linearised)
         known = {n: s.known[n] for n in s.sights[-1].serials.tolist() if n in s.known and s.known[n].used < 0}
         used = {n: replace(one, used=s.number) for n, one in known.items()}
         s = replace(
-            s, poses=poses, last=last, pair=pair, shared=shared, spread=spread, landmarks=marks,
+            s, poses=poses, pair=pair, shared=shared, spread=spread, landmarks=marks, anchor=s.number, solved=s.number,
             known={**s.known, **used} if used else s.known,
         )  # fmt: skip
         lag = self.config.lag
-        kept = len(s.poses) if lag is None else lag + 1 + self.config.past
-        return s if lag is None or len(s.poses) < 1.5 * kept else s.without_old(kept, lag)
+        grown = lag is not None and len(s.poses) >= 1.5 * (lag + 1 + self.config.past)
+        return s.without_old(self.config.past, lag) if lag is not None and grown else s
 
     # --- landmarks ---
 
@@ -179,7 +187,7 @@ class Steps(RectifiedMeasurement):
         Raises MeasurementError where one is in the map already, or has no right pixel or no positive depth.
         """
         s.landmarks.require_new(ids)
-        s = s if s.inside else _entered(s)
+        s = _anchored(s)
         marks, new = _seen_from_newest(s, ids, *self.first_sight(ids, z)), np.arange(len(ids))
         marks = replace(marks, information=np.zeros_like(marks.information)).measured(new, z, s.number, self.track)
         s = replace(s, sights=(*s.sights[:-1], s.sights[-1].joined(Sight.of(marks, new, z))))
@@ -194,13 +202,10 @@ class Steps(RectifiedMeasurement):
 
     def placed(self, s: SmootherState, ids: IdArray, local: Array, covariances: Array) -> SmootherState:
         """With landmarks known in the newest camera's coordinates; see `slam.interfaces.MapBackend.place`."""
+        s = _anchored(s)
         marks = _seen_from_newest(s, ids, local, covariances, np.zeros((len(ids), 3, s.by_rig.shape[1])))
-        T, by_pose = inverse(s.poses[-1]) @ s.last[1], points_by_pose(local)
-        there = T[:3, :3] @ (covariances + by_pose @ s.own @ np.swapaxes(by_pose, 1, 2)) @ T[:3, :3].T
-        relative = zip(marks.serial.tolist(), transform(T, local), there)
-        return replace(
-            _with(s, marks), known={**s.known, **{serial: Known(x, P, s.number) for serial, x, P in relative}}
-        )
+        known = {n: Known(x, P, s.number) for n, x, P in zip(marks.serial.tolist(), local, covariances)}
+        return replace(_with(s, marks), known={**s.known, **known})
 
     def removed(self, s: SmootherState, ids: IdArray) -> SmootherState:
         """Without landmarks; what their measurements say of the poses stays.
@@ -213,93 +218,57 @@ class Steps(RectifiedMeasurement):
 
     def landmark_covariances(self, s: SmootherState, graph: Graph, rows: IndexArray) -> Array:
         """Covariances (M, 3, 3) of landmarks in the world."""
-        marks, joint = s.landmarks, graph.joint_covariance(s)[1]
-        C = marks.covariances(self.stereo, self.models.pixel_sigma, rows, s.first, s.poses, joint)
+        marks, last = s.landmarks, max(s.anchor, s.solved)
+        joint, poses = graph.joint_covariance(s, s.begun, last)[1], s.poses[: s.of(last) + 1]
+        C = marks.covariances(self.stereo, self.models.pixel_sigma, rows, s.first, poses, joint)
         for i in np.flatnonzero(marks.factor[rows] == VARIABLE):
             found = graph.landmark_covariance(s, int(marks.serial[rows[i]]), marks.position[rows[i]])
             C[i] = C[i] if found is None else found
         return C
 
 
-def _tie(
-    s: SmootherState, relative: Array, own: Array, shared: Array, dt: float, first: bool, rests: bool
-) -> Tie:  # fmt: skip
-    """What the motion model says of the frame `dt` [s] after the last one, which is there relative to the graph.
+def _begun(s: SmootherState, T: Array, P: Array) -> SmootherState:
+    """With the newest pose, at T (4, 4) with a covariance P (6, 6), as the one with which the problem begins (anew).
 
-    In a gap of frames of d_j [s], T together, impulses w_j change the velocity: the mean one in the gap differs from
-    that before by ``Σ w_j a_j / T``, with a_j the time from frame j's start to the gap's end, and from the last one by
-    ``Σ w_j b_j / T`` with ``b_j = T − a_j``. What the two ends of a gap share correlates the factors there. Each has
-    the variance of its own and the covariance of both besides, with which they are as good as independent, and never
-    too sure: ``Σ d_j a_j / T`` at its beginning and ``Σ d_j b_j / T`` at its end, times the model's variance by time.
+    Landmarks go on as they stand; what they were measured from is no part of it.
     """
-    tie, span, weight = Tie(relative, own, shared), dt, dt * dt
-    if not s.inside:
-        if s.tie is None or s.tie.span is None or s.tie.times is None or first or rests:
-            return tie
-        span, first = s.tie.span + dt, bool(np.isnan(s.tie.times[0]))
-        weight = s.tie.weight + dt * span
-    tie, before, earlier, changed = replace(tie, span=span, weight=weight), s.ties[-1], math.nan, 0.0
-    if rests:
-        return tie
-    if not first:
-        if before is None or before.span is None or motion.is_first(before.span, span):
-            return tie
-        turn = rotation_angle(s.poses[-2][:3, :3].T @ s.poses[-1][:3, :3]) * span / before.span
-        if not s.inside and turn + _SURE * math.sqrt(own[:3, :3].diagonal().max()) > math.pi:
-            return tie
-        earlier, changed = -before.span, before.span - before.weight / before.span
-    return replace(tie, times=np.array([earlier, 0.0, span]), over=weight / span + changed)
-
-
-def _begun(s: SmootherState, T: Array, covariance: Array, sight: Sight) -> SmootherState:
-    """With the newest frame, at T (4, 4), as the pose of the graph with which the problem begins (anew)."""
-    number = s.number + 1 if s.started else 0
+    pair, shared = _ALONE
     return replace(
-        s, begun=number, poses=np.concatenate([s.poses, T[None]]), sights=(*s.sights, sight), ties=(*s.ties, None),
-        spread=np.concatenate([s.spread, covariance[None]]), last=np.stack([s.last[0], T]), pair=np.zeros((12, 12)),
-        shared=np.zeros((6, 12)), prior=covariance, start=T, turned=T[:3, :3] @ covariance[:3, :3] @ T[:3, :3].T,
-        since=0, inside=True, tie=None,
+        s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread[:-1], P[None]]),
+        pair=pair, shared=shared, prior=P, start=T, turned=T[:3, :3] @ P[:3, :3] @ T[:3, :3].T,
+        begun=s.number, anchor=s.number, landmarks=s.landmarks.without_measurements(np.ones(len(s.landmarks), bool)),
+        known={serial: one for serial, one in s.known.items() if one.pose < 0},
     )  # fmt: skip
 
 
-def _smoothed(s: SmootherState, T: Array, information: Array, by_rig: Array) -> SmootherState:
-    """With the newest frame at T (4, 4), by measurements with an information (6, 6), and the frame before it likewise.
+def _anchored(s: SmootherState) -> SmootherState:
+    """With the newest pose as the anchor, where it is predicted if nothing was measured.
 
-    The newest one's derivatives by errors of the rig are `by_rig` (6, m).
+    Where it may have turned anyhow since, no linearisation holds: the problem begins anew.
     """
-    own = np.linalg.inv(information + np.linalg.inv(s.own))
-    gain = s.pair[:6, 6:] @ np.linalg.inv(s.own)
-    P = s.pair.copy()
-    P[:6, :6] -= gain @ (s.own - own) @ gain.T
-    P[:6, 6:] = gain @ own
-    P[6:, :6], P[6:, 6:] = P[:6, 6:].T, own
-    before = s.last[0] @ exp(gain @ log(inverse(s.last[1]) @ T))
-    both = np.concatenate([s.by_rig[:6] + gain @ (by_rig - s.by_rig[6:]), by_rig])
-    return replace(s, last=np.stack([before, T]), pair=0.5 * (P + P.T), by_rig=both)
-
-
-def _joined(s: SmootherState, sight: Sight) -> SmootherState:
-    """With the newest frame as a pose of the graph, from which this was measured."""
-    return replace(
-        s, poses=np.concatenate([s.poses, s.last[1:]]), sights=(*s.sights, sight), ties=(*s.ties, s.tie),
-        spread=np.concatenate([s.spread, s.covariance[None]]), inside=True,
-    )  # fmt: skip
-
-
-def _entered(s: SmootherState) -> SmootherState:
-    """With the newest frame as a pose of the graph where it is predicted; the graph has it from the next update on."""
-    pair, shared = _before(np.roll(s.pair, 6, (0, 1)), s.last[1], s.last[0])
-    A, B = (adjoint(inverse(T) @ one) for T, one in ((s.last[1], s.poses[-1]), (s.last[0], s.last[1])))
+    if s.anchor == s.number:
+        return s
+    s = replace(_seeing(s), landmarks=s.landmarks.left_behind(np.zeros(0, np.intp), s.poses[-1], s.own))
+    if unknown_turn(s.own):
+        return _begun(s, s.poses[-1], s.spread[-1])
+    pair, shared = _before(np.roll(s.pair, 6, (0, 1)), s.poses[-2:])
+    at = s.poses[s.of(s.anchor)]
+    A, B = (adjoint(inverse(T) @ one) for T, one in ((s.poses[-1], at), (s.poses[-2], s.poses[-1])))
     shared[:, :6] += A @ (s.shared[:, :6] - s.shared[:, 6:] @ B.T)
-    marks = s.landmarks.left_behind(np.zeros(0, np.intp), s.last[1], s.own)
-    return replace(_joined(s, Sight.none()), pair=pair, shared=shared, landmarks=marks, measured=True)
+    return replace(s, pair=pair, shared=shared, anchor=s.number)
 
 
-def _before(P: Array, newest: Array, before: Array) -> tuple[Array, Array]:
-    """`SmootherState.pair` and `shared` where the newest frame is the newest pose of the graph.
+def _seeing(s: SmootherState) -> SmootherState:
+    """With the newest pose as one that saw something."""
+    return replace(s, ages=np.append(s.ages[:-1], s.ages[-2:][0] + 1))
 
-    P (12, 12) is the joint covariance of that (4, 4), and of the frame before (4, 4).
+
+def _before(P: Array, poses: Array) -> tuple[Array, Array]:
+    """`SmootherState.pair` and `shared` where the newest pose is the anchor.
+
+    P (12, 12) is the joint covariance of that and of the pose before; `poses` (2, 4, 4) is that before, and the newest.
     """
+    before, newest = poses
     pair, shared = np.zeros((12, 12)), np.zeros((6, 12))
     pair[:6, :6] = relative_covariance(P, newest, before)
     shared[:, :6] = P[:6, 6:] - P[:6, :6] @ adjoint(inverse(before) @ newest).T
@@ -333,14 +302,16 @@ def _landmarks_by_rig(
     return np.asarray(by_rig + gain @ rest)
 
 
-def _drift(P: Array, before: Array, newest: Array) -> Array:
-    """By how much (6, 6) the newest pose is less certain than the one before, from their joint covariance (12, 12).
+def _drift(s: SmootherState, solved: Solved) -> Array:
+    """By how much (6, 6) the newest pose is less certain than the anchor before it.
 
     It stands for the covariance of the motion between them, which it is where the motion has nothing to do with the
     error before.
     """
-    A = adjoint(inverse(newest) @ before)
-    values, vectors = np.linalg.eigh(P[6:, 6:] - A @ P[:6, :6] @ A.T)
+    inside, P = s.anchor >= solved.first, solved.covariance
+    before = solved.poses[s.anchor - solved.first] if inside else s.poses[s.of(s.anchor)]
+    A = adjoint(inverse(solved.poses[-1]) @ before)
+    values, vectors = np.linalg.eigh(P[12:, 12:] - A @ (P[:6, :6] if inside else s.spread[s.of(s.anchor)]) @ A.T)
     return np.asarray((vectors * values.clip(min=0)) @ vectors.T)
 
 
@@ -353,13 +324,9 @@ def _seen_from_newest(
 ) -> SmootherLandmarks:
     """New landmarks at `local` (M, 3) in the newest camera, with covariances (M, 3, 3) in its axes.
 
-    Errors of the rig move them there by `by_rig` (M, 3, m). From a frame that saw nothing else they are as uncertain as
-    it is itself, given the newest pose of the graph.
+    Errors of the rig move them there by `by_rig` (M, 3, m).
     """
-    T = s.last[1]
-    if not s.inside:
-        by_pose = points_by_pose(local)
-        covariances = covariances + by_pose @ s.own @ np.swapaxes(by_pose, 1, 2)
+    T = s.poses[-1]
     own = T[:3, :3] @ covariances @ T[:3, :3].T
     own = 0.5 * (own + np.swapaxes(own, 1, 2))
     by_rig = T[:3, :3] @ (by_rig - points_by_pose(local) @ s.by_rig[6:])

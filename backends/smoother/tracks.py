@@ -11,11 +11,13 @@ import numpy as np
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
 from backends.smoother.landmarks import VARIABLE
 from backends.smoother.state import SmootherState
-from slam.geometry.se3 import Array, transform
+from slam.geometry.se3 import Array, inverse, transform
+from slam.window.motion import STANDS, is_first
 
 #: Times of variables, as gtsam's stubs have them.
 Stamps = dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex]
 
+_LOOSE = np.repeat([3.0, 100.0], 3)  # numerics: deviations [rad], [m] of a motion that is unknown
 _LONGEST = 64  # cost: measurements in a factor of what was a variable; its cost grows with their square
 
 
@@ -45,7 +47,7 @@ class GraphProblem:
     removed: list[int] = field(default_factory=list)  # slots of factors that others replace
     # smart factors with new measurements, by serial number of the landmark and number of the first pose
     grown: dict[tuple[int, int], Track] = field(default_factory=dict)
-    # times of variables for the fixed lag: numbers of poses
+    # times of variables for the fixed lag: `SmootherState.ages`
     stamps: Stamps = field(default_factory=dict)
     to_graph: Array = field(default_factory=lambda: np.eye(4))  # takes the state's coordinates to gtsam's
 
@@ -65,22 +67,28 @@ class Tracks:
         self._make, self._lag = make, lag
         self._smart: dict[int, Track] = {}
         self._variables: dict[int, int] = {}  # numbers of the poses as long as which they stay
-        self._solved = -1  # number of the newest pose that was solved for
+        self._oldest = 0  # number of the oldest pose in the graph
 
     def add_pose(self, problem: GraphProblem, s: SmootherState, number: int, first: int) -> None:
-        """A pose, and its tie to the one before it, if it is not the first one."""
-        row = s.of(number)
-        tie = s.ties[row]
-        if tie is not None and number != first:
-            unknown = tie.times is not None and np.isnan(tie.times[0])
-            if tie.times is None or (not unknown and number - 2 < first):
-                factor = self._make.tie(number - 1, number, tie.relative, tie.covariance)
-            else:
-                keys = [pose_key(i) for i in range(number - (1 if unknown else 2), number + 1)]
-                factor = self._make.motion(keys, np.diff(tie.times), tie.over)
-            problem.factors.add(factor)
-        problem.values.insert(pose_key(number), to_pose3(problem.to_graph @ s.poses[row]))
-        problem.stamps[pose_key(number)] = float(number)
+        """A pose, and its motion since the one before it, if it is not the first one."""
+        if number > first:
+            problem.factors.add(self._motion(s, number, first))
+        problem.values.insert(pose_key(number), to_pose3(problem.to_graph @ s.poses[s.of(number)]))
+        problem.stamps[pose_key(number)] = float(s.ages[s.of(number)])
+
+    def _motion(self, s: SmootherState, number: int, first: int) -> gtsam.NonlinearFactor:
+        """What the motion model says of a pose: its velocity is that between the two poses before, but for noise.
+
+        Where the graph has but one of these two, the pose is hardly held where it is.
+        """
+        row, (dt, before) = s.of(number), s.intervals(number)
+        if s.rests[row]:
+            return self._make.tie(number - 1, number, np.eye(4), STANDS)
+        if not is_first(before, dt) and number - 2 < first:
+            return self._make.tie(number - 1, number, inverse(s.poses[row - 1]) @ s.poses[row], _LOOSE)
+        count = 2 if is_first(before, dt) else 3
+        keys = [pose_key(i) for i in range(number + 1 - count, number + 1)]
+        return self._make.motion(keys, np.array([before or np.nan, dt]))
 
     def add_rows(self, problem: GraphProblem, s: SmootherState, number: int, first: int, begin: int = 0) -> None:
         """What was measured from a pose, from some row on."""
@@ -90,7 +98,7 @@ class Tracks:
         for serial, factor, z in zip(*rows):
             point = make.point(z)
             if known and self._is_variable(problem, s, serial, factor, number, first):
-                self._stays(problem, serial, number)
+                self._stays(problem, s, serial, number)
                 problem.factors.add(make.explicit(point, number, serial))
                 continue
             track = self._smart.get(serial)
@@ -111,17 +119,17 @@ class Tracks:
         """Variables that the state keeps do not leave; their serial numbers."""
         kept = list(filter(self._is_there, s.landmarks.serial[s.landmarks.factor == VARIABLE].tolist()))
         for serial in kept:
-            self._stays(problem, serial, s.number)
+            self._stays(problem, s, serial, s.number)
         return kept
 
     def _is_there(self, serial: int) -> bool:
         """Whether a variable has not left the lag."""
-        return serial in self._variables and (self._lag is None or self._variables[serial] >= self._solved - self._lag)
+        return serial in self._variables and self._variables[serial] >= self._oldest
 
-    def _stays(self, problem: GraphProblem, serial: int, number: int) -> None:
+    def _stays(self, problem: GraphProblem, s: SmootherState, serial: int, number: int) -> None:
         """A variable stays for as long as a pose."""
         self._variables[serial] = number
-        problem.stamps[landmark_key(serial)] = float(number)
+        problem.stamps[landmark_key(serial)] = float(s.ages[s.of(number)])
 
     def _turn(self, problem: GraphProblem, s: SmootherState, serial: int, number: int) -> None:
         """A landmark becomes a variable, if the state has it as one, with the measurements of its smart factor."""
@@ -135,7 +143,7 @@ class Tracks:
         for pose, point in zip(track.poses, track.points):
             problem.factors.add(self._make.explicit(point, pose, serial))
         problem.values.insert(landmark_key(serial), transform(problem.to_graph, s.landmarks.position[row])[0])
-        self._stays(problem, serial, number)
+        self._stays(problem, s, serial, number)
 
     def _is_variable(
         self, problem: GraphProblem, s: SmootherState, serial: int, factor: int, number: int, first: int
@@ -177,13 +185,12 @@ class Tracks:
                 problem.factors.add(self._make.smart(track.points, track.keys, careful))
         return made
 
-    def forget(self, s: SmootherState) -> None:
+    def forget(self, s: SmootherState, oldest: int) -> None:
         """After its newest pose was solved for: forget what will not grow or come back; once in a while.
 
         Of a landmark of which more is known it stays known that this is used up.
         """
-        self._solved = s.number
+        self._oldest = oldest
         if self._lag is not None and not s.number % self._lag:
-            oldest = s.number - self._lag
             self._smart = {n: track for n, track in self._smart.items() if track.poses[0] >= oldest}
             self._variables = {n: last for n, last in self._variables.items() if last >= oldest or n in s.known}

@@ -42,7 +42,9 @@ def make_filters(octave: int, layers: int, scale: float, stride: int) -> Filters
     weights = np.stack([(scale / area) ** 2, 0.81 * (scale / area_xy) ** 2], axis=1).astype(np.float32)
     step = 1 << octave
     parts, columns = _read_columns(corners, step, -(-stride // step))
-    offsets = _corner_offsets(corners, stride)
+    top, bottom, left, right = (corners[:, [box[k] for box in BOXES]] for k in range(4))
+    ends = [top * stride + left, top * stride + right, bottom * stride + left, bottom * stride + right]
+    offsets = np.ascontiguousarray(np.stack(ends, axis=2).reshape(len(corners), -1)).astype(np.uint64)
     return Filters(step, sizes, sizes // 2 // step, corners.astype(np.uint64), weights, offsets, parts, columns)
 
 
@@ -56,13 +58,6 @@ BOXES = (
     (2, 7, 0, 9), (2, 7, 3, 6), (0, 9, 2, 7), (3, 6, 2, 7),
     (1, 4, 1, 4), (5, 8, 5, 8), (1, 4, 5, 8), (5, 8, 1, 4),
 )  # fmt: skip
-
-
-def _corner_offsets(corners: NDArray[np.int64], stride: int) -> NDArray[np.uint64]:
-    """Flat offsets (L, 32) of the boxes' corners: top left, top right, bottom left, bottom right of each."""
-    top, bottom, left, right = (corners[:, [box[k] for box in BOXES]] for k in range(4))
-    offsets = [top * stride + left, top * stride + right, bottom * stride + left, bottom * stride + right]
-    return np.ascontiguousarray(np.stack(offsets, axis=2).reshape(len(corners), -1)).astype(np.uint64)
 
 
 def _read_columns(corners: NDArray[np.int64], step: int, n: int) -> tuple[NDArray[np.bool_], NDArray[np.uint64]]:

@@ -60,7 +60,9 @@ def grey(image: NDArray, what: str = "image") -> NDArray:
             f"{what}: is {image[()]!r:.40} and no array; of a file it cannot read, cv2.imread gives None"
         )
     if image.dtype.newbyteorder("=") not in _FULL_SCALE:
-        hint = "; of values from 0 to 1: (255 * image).astype(np.uint8)" if image.dtype.kind == "f" else ""
+        whole = image.dtype.kind not in "fb" or (image.size and image.max() > 1)
+        cure = "image.astype(np.uint8), if its values are 0 to 255" if whole else "(255 * image).astype(np.uint8)"
+        hint = f"; give {cure}" if image.dtype.kind in "fbiu" else ""
         raise SequenceError(f"{what}: pixels must be uint8 or uint16, not {image.dtype}{hint}")
     channels = image.shape[2] if image.ndim == 3 else 1
     if image.ndim not in (2, 3) or channels not in (1, 3, 4):

@@ -23,17 +23,13 @@ class Disc(NamedTuple):
     bins: NDArray[np.uint64]  # bin of each degree 0..360 (361,), counted from the first window's first one
 
 
-def _disc() -> Disc:
-    line = np.arange(-RADIUS, RADIUS + 1)
-    weight = np.exp(-(line**2) / (2 * _SIGMA**2))
-    weight /= weight.sum()
-    places = np.argwhere(line[:, None] ** 2 + line[None] ** 2 <= RADIUS**2)
-    degrees = np.arange(361) % 360
-    bins = (2 * (degrees // 5) + (degrees % 5 > 0) + _WINDOW // 2) % _BINS
-    return Disc(places.astype(np.uint64), weight[places].prod(axis=1).astype(np.float32), bins.astype(np.uint64))
-
-
-DISC = _disc()
+_LINE, _DEGREES = np.arange(-RADIUS, RADIUS + 1), np.arange(361) % 360
+_PLACES = np.argwhere(_LINE[:, None] ** 2 + _LINE[None] ** 2 <= RADIUS**2)
+_WEIGHT = np.exp(-(_LINE**2) / (2 * _SIGMA**2))
+DISC = Disc(
+    _PLACES.astype(np.uint64), (_WEIGHT / _WEIGHT.sum())[_PLACES].prod(axis=1).astype(np.float32),
+    ((2 * (_DEGREES // 5) + (_DEGREES % 5 > 0) + _WINDOW // 2) % _BINS).astype(np.uint64),
+)  # fmt: skip
 
 
 @vector_helper

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.runtime.threads import free_cores
+
 _SMALLEST_SHARE = 32  # cost: items that are worth a task
 
 
@@ -27,7 +29,7 @@ class Workers:
 
     def run(self, tasks: Sequence[Callable[[], Any]]) -> list[Any]:
         """Results of independent tasks, in their order."""
-        if self._threads == 1 or len(tasks) < 2:
+        if len(tasks) < 2 or min(self._threads, free_cores()) == 1:
             return [task() for task in tasks]
         if self._pool is None:
             self._pool = ThreadPoolExecutor(self._threads - 1, thread_name_prefix="surf")
@@ -39,7 +41,7 @@ class Workers:
 
     def over(self, count: int, function: Callable[[int, int], tuple[NDArray, ...]]) -> list[NDArray]:
         """The arrays of ``function(first, last)`` of consecutive shares of `count` items, put together."""
-        shares = 1 if self._threads == 1 else max(1, min(self._threads, count // _SMALLEST_SHARE))
+        shares = max(1, min(self._threads, free_cores(), count // _SMALLEST_SHARE))
         edges = [count * k // shares for k in range(shares + 1)]
         found = self.run([partial(function, a, b) for a, b in pairwise(edges)])
         return list(found[0]) if shares == 1 else [np.concatenate(parts) for parts in zip(*found)]

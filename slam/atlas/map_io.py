@@ -24,7 +24,7 @@ from slam.atlas.keyframes import Keyframe, Loop
 from slam.checks import FARTHEST_POSITION, MOST_ID, definite, require_known
 from slam.data import Estimate, IdArray
 from slam.errors import MeasurementError, SlamError
-from slam.files import Kind, array, json_text, read_bytes, require_arrays, unpack, whole_file
+from slam.files import Kind, json_text, read_bytes, require_arrays, unpack, whole_file
 from slam.geometry.rig import StereoRig
 from slam.geometry.rig_numbers import rig_difference, rig_numbers
 from slam.geometry.se3 import Array, nearest_rotation
@@ -269,15 +269,11 @@ def decode(data: bytes, source: str) -> SavedMap:
         raise SlamError(f"{source}: a map of version {version!r}; {known}")
     if hashlib.sha256(body).hexdigest().encode() != digest:
         raise SlamError(f"{source}: the map was altered or cut short: its checksum is wrong")
-    members = unpack(body, source)
-    missing = {"header.json", *(f"{name}.npy" for name in _ARRAYS)} - set(members)
-    if missing:
-        raise SlamError(f"{source}: the map lacks {min(missing)}")
+    members = unpack(body, source, ("header.json", *_ARRAYS))
     header = json_text(members["header.json"], f"{source}: header.json")
     if not isinstance(header, dict) or any(not isinstance(header.get(name), str) for name in _TEXTS):
         raise SlamError(f"{source}: header.json must give {', '.join(_TEXTS)}")
-    arrays = {name: array(members[f"{name}.npy"], name, source) for name in _ARRAYS}
-    return map_of(arrays, {name: header[name] for name in _TEXTS}, source)
+    return map_of(members, {name: header[name] for name in _TEXTS}, source)
 
 
 def map_arrays(saved: SavedMap) -> dict[str, np.ndarray]:

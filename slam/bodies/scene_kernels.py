@@ -310,7 +310,9 @@ def groups_apart(L, eta, dWd, place, starts, tracks, centres, widths, asked, sup
                 rows[m] = rest[m] and not seeds[m]
             _common_motion(L, eta, dWd, rows, work, motion)
             _squares_against(L, eta, dWd, motion, scale, work[3], apart)
-            rows[:], found = seeds, size
+            for m in range(n):  # a slice would make Numba compile messages about shapes, for two seconds
+                rows[m] = seeds[m]
+            found = size
             for _ in range(2):
                 if found < support:
                     break

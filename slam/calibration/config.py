@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from slam.bounds import require_positive
+from slam.bounds import require_not_negative
 
 
 @dataclass(frozen=True)
@@ -34,4 +34,4 @@ class SelfCalibrationConfig:
     inflation: ClassVar[float] = 4.0
 
     def __post_init__(self) -> None:
-        require_positive(self, {"systematic": (1e-4, 1e4)}, "self_calibration")  # [px]
+        require_not_negative(self, {"systematic": (1e-4, 1e4)}, "self_calibration")  # [px]

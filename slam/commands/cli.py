@@ -16,6 +16,7 @@ from typing import Annotated, Any, TypeAlias
 import typer
 
 from slam.commands.ending import catch_signals, one_line_errors, whole_frames
+from slam.errors import ConfigurationError
 from slam.registry import ONLINE
 
 app = typer.Typer(
@@ -68,6 +69,8 @@ def main() -> None:
         if isinstance(stream, TextIOWrapper):  # a terminal that knows no sigma
             stream.reconfigure(errors="backslashreplace")
     with one_line_errors():
+        for name in ("matplotlib", "PIL"):
+            logging.getLogger(name).setLevel(logging.ERROR)  # what they warn of is ours to mend
         logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
         notes, handler = logging.getLogger("slam.runtime.compilation"), logging.StreamHandler()
         handler.setFormatter(logging.Formatter("slam: %(message)s"))
@@ -231,7 +234,7 @@ def settings_command(
 @app.command("compare", short_help="Compare back ends on the same recordings.")
 def compare_command(
     sequences: Annotated[list[str], argument("Folders, or synthetic:NAME?key=value.", "SEQUENCE")],
-    out: Annotated[Path, option("Folder; a comparison that was stopped in it goes on.", "DIR", "--out", "-o")],
+    out: Annotated[_File, option("Folder; a comparison that was stopped in it goes on.", "DIR", "--out", "-o")] = None,
     backends: Annotated[str, option("Back ends; the first is the reference.", "A,B,...")] = ",".join(ONLINE),
     frontend: Annotated[str, option("Front end; simulated: a world's own features, no images.", "NAME")] = "surf",
     settings: _Set = None,
@@ -252,6 +255,8 @@ def compare_command(
 
     masked, names = (with_mask(text, mask) for text in sequences), filter(None, backends.split(","))
     start, stop = parse_frames(frames)
+    if out is None:
+        raise ConfigurationError("slam compare needs --out DIR, a folder for its report, tables and runs")
     plan = Plan(tuple(masked), tuple(names), frontend, tuple(settings or ()), trials, start, stop, replay)
     runs = command.compare(plan, out, workers, quiet, overwrite, command_line())
     if not any(run.trusted for run in runs):

@@ -24,9 +24,7 @@ from slam.sequences import open_sequence
 
 #: As real cameras differ from their calibration; with exact ones errors would be a third of what covariances claim.
 _WORLD = "synthetic:aisle?frames={}&speed=2&box=1&focal_error=0.002&turn_error=0.7"
-_WHY = """The demo's cameras differ from their calibration as real ones do: by 0.2 % in
-focal length, the right one turned by 0.7 mrad. Covariances count such errors;
-with exact cameras they would be too large."""
+_WHY = "Errors over claimed σ: at 2 they are twice as large as claimed."
 
 _FRAME = "frame.png"
 _SECONDS = 0.07  # of a frame, about

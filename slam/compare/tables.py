@@ -9,17 +9,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from slam.compare.plan import REPLAY, Plan
 from slam.compare.statistics import Difference, difference, reach
 from slam.compare.sweep import Run
-from slam.files import write_text
+from slam.files import read_object, write_text
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import pair
 from slam.run.outputs import csv_number, csv_rows
-from slam.run.results import COMPARED, DOUBTED, Metric, number, verdict
+from slam.run.results import COMPARED, DOUBTED, Metric, number, truth_is_exact, verdict, verdict_of_run
 from slam.run.run_data import RunData
 
 DIFFERENCE_COLUMNS = (
@@ -148,7 +149,8 @@ def sentences(group: Group) -> list[str]:
     if all(group.failures(backend) == group.trials for backend in group.runs):
         found.append("No run completed.")
     elif not group.has_truth:
-        found.append("No true path is known (see the option truth=FILE): nothing tells which path is better.")
+        few = "Too few images have a true pose" if "truth=" in group.sequence else "No true path is known"
+        found.append(f"{few} (see the option truth=FILE): nothing tells which path is better.")
         apart = ((other, distance_apart(group.runs[first], group.runs[other])) for other in others)
         found += [
             f"Final paths of {first} and {other} are {number(1e3 * d)} mm apart (RMS)." for other, d in apart if d >= 0
@@ -156,6 +158,8 @@ def sentences(group: Group) -> list[str]:
     else:
         judged = [other for other in others if group.trials not in (group.failures(first), group.failures(other))]
         found = [in_short([group.compared[m.key][other] for m in group.metrics], first, other) for other in judged]
+    if line := truth_line(group):
+        found.append(line)
     if counts := [f"{n} of {group.trials} of {backend}" for backend in group.runs if (n := group.failures(backend))]:
         failed = "a trial in which either failed is no pair, and is in no other figure."
         found.append(f"Runs failed, {', '.join(counts)}: {failed}")
@@ -178,20 +182,40 @@ def in_short(differences: Sequence[Difference], reference: str, other: str) -> s
     """Which of two back ends is better in what, in one sentence: in all figures that can be told apart."""
     parts = []
     for word, first, second in (("better", other, reference), ("worse", reference, other)):
-        names = [d.metric.label.partition(" (")[0] for d in differences if d.verdict == word]
+        judged = [d.metric.label for d in differences if d.verdict == word]
+        names = list(dict.fromkeys(label.partition(" (")[0] for label in judged))
         if names:
             parts.append(f"{first} is better than {second} in {', '.join(names)}")
     return f"{'; '.join(parts) or f'No difference between {reference} and {other} can be concluded'}."
 
 
 def honesty(group: Group) -> list[str]:
-    """Whether the covariances of each back end hold, by the means over its runs."""
+    """Whether the covariances of each back end hold, by the means over its runs; where that is open, why."""
     said = {}
     for backend in group.runs:
         keys = dict.fromkeys(key for run in group.runs[backend] for key in run.metrics)
         means = {key: group.mean_and_sd(backend, key)[0] for key in keys}
         said[backend] = verdict(means, group.trials - group.failures(backend))
+        if not said[backend] and (summary := _summary(group.runs[backend])):
+            said[backend] = verdict_of_run(summary)
     return [f"{backend}: {text}." for backend, text in said.items() if text]
+
+
+def truth_line(group: Group) -> str:
+    """Which frames of the first run have a true pose, and which errors of it are counted; empty where none has."""
+    summary = next(filter(None, map(_summary, group.runs.values())), {})
+    truth, known = summary.get("truth"), (summary.get("accuracy") or {}).get("online", {}).get("poses with truth")
+    if not truth or known is None or summary["format"] == "synthetic":
+        return ""
+    sigma = f"σ {number(1e3 * truth['translation'])} mm and {number(np.degrees(truth['rotation']))}°"
+    errors = "is taken as exact" if truth_is_exact(summary) else f"has errors of {sigma}, which are counted"
+    return f"The true path {errors}; {known:.0f} of {summary['frames']} frames have it."
+
+
+def _summary(runs: Sequence[Run]) -> dict[str, Any]:
+    """What the first run that came to its end says; empty where none did."""
+    run = next((run for run in runs if run.completed and (run.folder / "summary.json").is_file()), None)
+    return {} if run is None else read_object(run.folder / "summary.json")
 
 
 def caution(plan: Plan, trials: int) -> str:

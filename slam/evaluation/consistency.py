@@ -35,6 +35,9 @@ EXACT = "exact calibration"
 #: The same, where the back end's covariances count no errors of the calibration, as others' do.
 PIXELS_ALONE = "pixel noise alone"
 
+#: Beside the figures, where there are any: how many poses come before the first one that has truth.
+BEFORE = "poses before the truth"
+
 _DOF = 6
 _SMALLEST = 1e-12  # eigenvalue of a covariance [rad², m²] below which it is none
 _ROUNDING = 1e-14  # eigenvalues below this share of the largest are rounding

@@ -51,7 +51,8 @@ class PathErrors:
 def associate(estimate: Trajectory, truth: Trajectory, tolerance: float = 0.02) -> tuple[Trajectory, Trajectory]:
     """Both paths at common stamps, row by row: the estimate's rows that have truth, and the truth for them.
 
-    The truth is taken between two true poses: positions linearly, orientations at constant angular velocity.
+    The truth is taken between two true poses: positions linearly, orientations at constant angular velocity. So it is
+    up to `tolerance` before the first one and after the last.
 
     Args:
         estimate: the estimated path.
@@ -64,7 +65,8 @@ def associate(estimate: Trajectory, truth: Trajectory, tolerance: float = 0.02) 
     own, stamps = truth.stamps, estimate.stamps
     rows = np.zeros(0, int)
     if len(own):
-        rows = np.flatnonzero((stamps >= own[0] - _ROUNDING) & (stamps <= own[-1] + _ROUNDING))
+        outside = tolerance if len(own) > 1 else _ROUNDING
+        rows = np.flatnonzero((stamps >= own[0] - outside) & (stamps <= own[-1] + outside))
         after = np.searchsorted(own, stamps[rows]).clip(min(1, len(own) - 1), len(own) - 1)
         before = (after - 1).clip(0)
         near = np.minimum(np.abs(own[after] - stamps[rows]), np.abs(own[before] - stamps[rows])) <= tolerance
@@ -74,7 +76,7 @@ def associate(estimate: Trajectory, truth: Trajectory, tolerance: float = 0.02) 
             f"no estimated pose has a true one within {tolerance:g} s: {_span('estimate', stamps)}, "
             f"{_span('truth', own)}"
         )
-    step, since = own[after] - own[before], stamps[rows].clip(own[0], own[-1]) - own[before]
+    step, since = own[after] - own[before], stamps[rows] - own[before]
     share = np.divide(since, step, out=np.zeros(len(rows)), where=step > 0)[:, None]
     first, second = truth.poses[before], truth.poses[after]
     turn = so3_log(np.swapaxes(first[:, :3, :3], 1, 2) @ second[:, :3, :3])

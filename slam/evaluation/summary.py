@@ -10,7 +10,7 @@ import numpy as np
 
 from slam.data import CommonError
 from slam.errors import TrajectoryError
-from slam.evaluation.consistency import consistency_figures
+from slam.evaluation.consistency import BEFORE, consistency_figures
 from slam.evaluation.metrics import absolute_errors, associate, relative_errors, segment_errors
 from slam.geometry.se3 import Array, inverse, so3_log
 from slam.geometry.trajectory import Trajectory, TruthNoise
@@ -93,9 +93,9 @@ def rotation_errors(own: Trajectory, true: Trajectory, mounting: float) -> Array
 def consistency(
     estimate: Trajectory, covariances: Array, sequence: Any, common: Sequence[CommonError] | None = None
 ) -> dict[str, float]:
-    """How honest the pose covariances are, see `slam.evaluation.consistency`; empty without truth for the first pose.
+    """How honest the pose covariances are, from the first pose that has truth; empty where none has.
 
-    Empty, too, where the path's errors and covariances are beyond computing.
+    See `slam.evaluation.consistency`. Empty, too, where the path's errors and covariances are beyond computing.
 
     Args:
         estimate: the online path.
@@ -104,9 +104,10 @@ def consistency(
         common: the part of the covariances that the poses share (N); None where that is not known, or nothing.
     """
     pairs = with_truth(estimate, sequence)
-    if pairs is None or pairs[0].stamps[0] != estimate.stamps[0]:
+    if pairs is None:
         return {}
     rows = np.searchsorted(estimate.stamps, pairs[0].stamps)
     noise = getattr(sequence, "truth_noise", TruthNoise())
     shared = None if common is None else [common[row] for row in rows]
-    return _where_possible(consistency_figures, *pairs, covariances[rows], noise, shared)
+    found = _where_possible(consistency_figures, *pairs, covariances[rows], noise, shared)
+    return found | ({BEFORE: float(rows[0])} if rows[0] and found else {})

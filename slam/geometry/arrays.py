@@ -45,11 +45,6 @@ def among(count: int, rows: IndexArray | IdArray) -> BoolArray:
     return out
 
 
-def ascending(ids: IdArray) -> bool:
-    """Whether ids (N,) ascend, each once."""
-    return bool((ids[1:] > ids[:-1]).all())
-
-
 def median(values: Array) -> float:
     """The median of some numbers: ``np.median``, which takes longer to begin than these need."""
     ordered = np.sort(values, axis=None)

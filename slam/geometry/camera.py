@@ -132,7 +132,7 @@ class PinholeCamera:
         """Undistorted normalised coordinates (N, 2) = (x/z, y/z) of pixels (N, 2); NaN stays NaN."""
         uv = np.asarray(uv, float).reshape(-1, 2)
         distorted = (uv - (self.u0, self.v0)) / (self.fu, self.fv)
-        return self._undistort(distorted) if self.has_distortion else distorted
+        return self._undistort(distorted) if self.has_distortion and len(uv) else distorted
 
     def rays(self, uv: Array) -> Array:
         """Rays (N, 3) = (x/z, y/z, 1) of pixels (N, 2)."""
@@ -155,10 +155,12 @@ class PinholeCamera:
         Rows outside the region where the distortion is one-to-one are NaN: there the polynomial folds far rays back
         into the image.
         """
-        if not self.has_distortion:
+        if not self.has_distortion or not len(ab):
             return ab
         if self.model == "equidistant":
-            return _distort_equidistant(ab, np.asarray(self.distortion))
+            import cv2
+
+            return np.asarray(cv2.fisheye.distortPoints(ab[:, None], np.eye(3), np.array(self.distortion))[:, 0])
         from slam.geometry import kernels
 
         return np.asarray(kernels.distort(np.ascontiguousarray(ab), self._coefficients, self._radius_limit))
@@ -183,7 +185,12 @@ class PinholeCamera:
     def _undistort(self, target: Array) -> Array:
         """Invert `_distort`; NaN where no ray leads to the pixel."""
         if self.model == "equidistant":
-            return _undistort_equidistant(target, np.asarray(self.distortion))
+            import cv2
+
+            until, lens = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-13), np.array(self.distortion)
+            ab = cv2.fisheye.undistortPoints(target[:, None], np.eye(3), lens, criteria=until)[:, 0]
+            off = np.abs(self._distort(ab) - target).max(axis=1, keepdims=True)
+            return np.where(off < 1e-9, ab, np.nan)  # 1e-9: of rays 90° or more off the axis OpenCV gives others
         from slam.geometry import kernels
 
         return np.asarray(kernels.undistort(np.ascontiguousarray(target), self._coefficients, self._radius_limit))
@@ -271,34 +278,3 @@ def floats(what: str, values: ArrayLike | None) -> Array:
         return np.array(values, float)
     except (TypeError, ValueError, OverflowError):
         raise CalibrationError(f"{what} must be numbers") from None
-
-
-def _undistort_equidistant(target: Array, coefficients: Array) -> Array:
-    """Newton steps on the angle θ alone; rays 90° or more off the axis are NaN."""
-    k1, k2, k3, k4 = coefficients
-    theta_d = np.hypot(target[:, 0], target[:, 1])
-    theta = np.minimum(theta_d, 1.5)
-    for _ in range(50):  # 50: of the fixed point at most; usual lenses need fewer than ten
-        t2 = theta * theta
-        value = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-        slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-        step = (value - theta_d) / slope
-        theta = theta - step
-        if not (np.abs(step) > 1e-13).any():  # 1e-13: in normalised coordinates: 1e-10 px at any usual focal length
-            break
-    with np.errstate(invalid="ignore"):
-        good = (np.abs(step) < 1e-9) & (theta < np.pi / 2 - 1e-6) & (theta >= 0)
-    theta = np.where(good, theta, np.nan)
-    near = theta_d < 1e-8
-    return target * np.where(near, 1.0, np.tan(theta) / np.where(near, 1.0, theta_d))[:, None]
-
-
-def _distort_equidistant(ab: Array, coefficients: Array) -> Array:
-    """Kannala-Brandt distortion: ``θ_d = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)`` along the ray's azimuth."""
-    k1, k2, k3, k4 = coefficients
-    r = np.hypot(ab[:, 0], ab[:, 1])
-    theta = np.arctan(r)
-    t2 = theta * theta
-    theta_d = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-    near = r < 1e-8
-    return np.asarray(ab * np.where(near, 1.0, theta_d / np.where(near, 1.0, r))[:, None])

@@ -48,7 +48,10 @@ class InputWarnings:
         self.doubt = ""  # the first of those after which no path can be trusted
         self.repeated = ""  # the warning of repeated images
         self._rig, self._rows = rig, rows
-        self._farthest = farthest_apart(rig, models)
+        # Time between frames [s] after which the prediction's rotation error (1σ) moves a feature by half an image: the
+        # angular velocity changes by ``density · √Δt`` in Δt, and the rotation by that times Δt.
+        half_view = float(np.arctan(0.5 * rig.width / rig.left.fu))
+        self._farthest = (half_view / models.motion.angular_acceleration) ** (2 / 3)
         self._stamps: list[float] = []
         self._count = self._poor = self._unpaired = 0
         self._pair_warned = self._pair_is_right = False
@@ -198,9 +201,12 @@ class InputWarnings:
                 share = found.off_rows / max(found.matches, 1)
                 if found.conclusive and not found.rows_differ and share < best and most(own.off_rows, found.off_rows):
                     best, said = share, f"{found.off_rows} of {found.matches} {how}"
-        cause = f"left and right image are not of one moment: {ONE_MOMENT}"
+        cause = f"left and right image are not of one moment ({ONE_MOMENT}), or the two cameras' K and D are exchanged"
         if "inverse" in said:
-            cause = "is R transposed, or from the right camera to the left one, or are the images not of one moment?"
+            cause = (
+                "is R transposed, or from the right camera to the left one, are the images not of one moment, or were "
+                "they rectified before?"
+            )
         return said and f"rows of {own.off_rows} of {own.matches} features differ, and {said}; {cause}"
 
     def copied(self, frame: StereoFrame, checksum: Checksum | None) -> tuple[Checksum | None, str]:
@@ -278,7 +284,7 @@ def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
     elif found.shown < 1:
         before = "the images were rectified before, or undistorted, and are again; give the calibration after that"
         if left.has_distortion or right.has_distortion:
-            cause = f"{before}, or leave the distortion out"
+            cause = f"{before}, or leave the distortion out; or it is that of another lens, or of one camera alone"
         else:
             cause = f"the lenses' distortion is missing in it; or {before}"
         if found.shown < -0.5:  # guard: between images without it, 0, and with the opposite, -1
@@ -288,20 +294,14 @@ def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
             f"rectification does to rows: {cause}"
         )
     else:
-        cause = "check that the calibration is this camera's, at this size, and that both images are of one moment"
+        cause = (
+            "check that the calibration is this camera's, at this size, that K and D of the two cameras are not "
+            "exchanged, that no image is mirrored, and that both are of one moment"
+        )
     return (
         f"rows of left and right image do not agree: {found.off_rows} of {found.matches} features are off by "
         f"{found.row_offset:.1f} px in the median; {cause}"
     )
-
-
-def farthest_apart(rig: StereoRig, models: EstimatorModels) -> float:
-    """Time between frames [s] after which the prediction's rotation error (1σ) moves a feature by half an image.
-
-    The angular velocity changes by ``density · √Δt`` in Δt, and the rotation by that times Δt.
-    """
-    half_view = float(np.arctan(0.5 * rig.width / rig.left.fu))
-    return float((half_view / models.motion.angular_acceleration) ** (2 / 3))
 
 
 def shows_something(image: object) -> bool:

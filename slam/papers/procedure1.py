@@ -19,7 +19,7 @@ from slam.bodies.config import ObjectsConfig
 from slam.bodies.detector import ObjectDetector
 from slam.data import Estimate, StereoFeatures
 from slam.errors import ConfigurationError
-from slam.files import Kind, array, read_bytes, require_arrays, unpack, whole_file
+from slam.files import Kind, read_bytes, require_arrays, unpack, whole_file
 from slam.geometry.arrays import isin
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, log, pose, transform
@@ -80,12 +80,9 @@ class ObjectDatabase:
     def load(cls, path: Path) -> ObjectDatabase:
         """Read what `save` wrote; ConfigurationError where there is no such file, or it is none of a database."""
         source = f"object database {path}"
-        members = unpack(read_bytes(path, _LARGEST, ConfigurationError), source, ConfigurationError)
-        if missing := [name for name in _ARRAYS if f"{name}.npy" not in members]:
-            raise ConfigurationError(f"{source}: damaged, or no database of an object: it lacks {missing[0]}")
-        arrays = {name: array(members[f"{name}.npy"], name, source, ConfigurationError) for name in _ARRAYS}
-        require_arrays(arrays, _ARRAYS, source, ConfigurationError)
-        return cls(**arrays)
+        found = unpack(read_bytes(path, _LARGEST, ConfigurationError), source, _ARRAYS, ConfigurationError)
+        require_arrays(found, _ARRAYS, source, ConfigurationError)
+        return cls(**{name: found[name] for name in _ARRAYS})
 
 
 @dataclass(frozen=True, eq=False)

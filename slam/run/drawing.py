@@ -202,7 +202,7 @@ class GrowingMap:
 def output(path: Path) -> Output:
     """What `FramePictures` writes: a video, or pictures in a folder."""
     film = path.suffix.lower() == _FILM
-    return Output(path, "--draw", None if film else ["[0-9]" * _DIGITS + "*.png"], makes_folder=True)
+    return Output(path, "--draw", None if film else ["[0-9]" * _DIGITS + "*.png"])
 
 
 class FramePictures(ExitStack):

@@ -19,9 +19,9 @@ import numpy as np
 from slam.errors import ConfigurationError, SlamError
 from slam.files import noting_inputs, whole_file
 from slam.geometry.se3 import Array, inverse, transform
+from slam.geometry.stamps import pair
 from slam.naming import unknown
 from slam.outputs import Output, require_outputs
-from slam.run.outputs import naming_folder
 from slam.run.results import facts, number
 from slam.run.run_data import RunData, place_of_truth, pose_errors, well_known
 from slam.run.schema import STAGE_NAMES, body_colour
@@ -59,6 +59,7 @@ _LOOPS = ("o", "k", "loops closed"), ("x", _DOUBT, "loops refused")
 _NAME = 2.0  # [in] room for a mark and its name
 _SIGMAS = 2.0  # size of ellipses
 _DECADES = 2.5  # of errors, at most: smaller ones are where an error changes its sign
+_STANDS = 0.01  # [m] within which a camera that stands is estimated
 _LEAST_SHARE = 0.002  # of the longest time: a stage below it is not seen, and not named
 
 
@@ -76,7 +77,7 @@ def plot_folders(folders: Sequence[Path], out: Path | None, kind: str, overwrite
             f"runs of {len(sequences)} sequences ({', '.join(sequences)}): draw those of one at a time"
         )
     file = out or runs[0].folder / (PICTURE if kind == "summary" else f"{kind}.png")
-    require_outputs([Output(file, "--out", makes_folder=True)], inputs, overwrite)
+    require_outputs([Output(file, "--out")], inputs, overwrite)
     plot(runs, file, kind)
     return file
 
@@ -112,8 +113,6 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary") -> None:
     from matplotlib import rc_context
 
     figure = drawn(runs, kind)
-    with naming_folder(path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as file, rc_context(_STYLE):
         metadata = {"Title": _title(runs), **_METADATA[suffix]}
         figure.savefig(file, format=suffix[1:], dpi=110, metadata=metadata)
@@ -204,7 +203,9 @@ def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
     shown = [0, 2] if extent[1] < extent.max() else [0 if extent[0] > extent[2] else 2, 1]
     signs = factor * np.array([1.0, 1.0 if shown[1] == 2 else -1.0])  # y points down
     if truth is not None:
-        axis.plot(*(signs * truth[:, shown]).T, "--", color=_TRUTH, lw=1.0, label="true path", zorder=3)
+        axis.plot(
+            *(signs * truth[:, shown]).T, "--", color=_TRUTH, lw=1.0, label=f"true path{_of_which(runs)}", zorder=3
+        )
     for run, colour, width in _coloured(runs):
         online, final = (signs * points[:, shown] for points in paths[run.name])
         axis.plot(*np.where(run.measured[:, None], online, np.nan).T, color=colour, lw=1.2 * width, alpha=0.75,
@@ -216,7 +217,12 @@ def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
             axis.plot(*final.T, ":", color=colour, lw=1.5, label=f"{run.name}, final")
     across, ahead = (f"{('right', 'up', 'forward')[k]} [{unit}]" for k in shown)
     view = "above" if shown[1] == 2 else "the side"
-    axis.set(title=f"Path from {view}, online (dot: start)", xlabel=across, ylabel=ahead)
+    title = f"Path from {view}, online (dot: start)"
+    if not any(run.measured[1:].any() for run in runs):
+        title = "No path: no frame after the first was tracked"
+    elif extent.max() < _STANDS:
+        title = f"The camera stands: all within {number(factor * float(extent.max()))} {unit}"
+    axis.set(title=title, xlabel=across, ylabel=ahead)
     if not extent.any():
         axis.update_datalim([(-1.0, -1.0), (1.0, 1.0)])
         axis.autoscale_view()
@@ -224,6 +230,17 @@ def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
     axis.legend(framealpha=0.8)
     axis.locator_params(axis="x", nbins=6)
     axis.grid(color="0.9", lw=0.5)
+
+
+def _of_which(runs: Sequence[RunData]) -> str:
+    """Whose true path is drawn, where runs have different ones."""
+    known = [(run.name, run.truth) for run in runs if run.truth is not None]
+    for _, other in known[1:]:
+        name, first = known[0]
+        rows = pair(first.stamps, other.stamps, 1e-6)
+        if not np.allclose(first.poses[rows >= 0], other.poses[rows[rows >= 0]], atol=1e-6):
+            return f" of {name}; others have another"
+    return ""
 
 
 def _unit(largest: float) -> tuple[float, str]:

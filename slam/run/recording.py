@@ -24,11 +24,11 @@ from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.checks import LATEST_STAMP, MOST_ID
 from slam.data import FrameResult, IdArray, Observations
 from slam.errors import MeasurementError, SequenceError, SlamError
-from slam.files import array, json_text, read_bytes, unpack, whole_file
+from slam.files import json_text, read_bytes, unpack, whole_file
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.geometry.trajectory import Trajectory
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.models import EstimatorModels, MotionModel, ObjectModels, SlideModel, models_for
 
 _HEADER = {"format": "surf-stereo-slam recording", "version": 3}
@@ -55,6 +55,7 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         pixels.append(np.full((gone, 4), np.nan))
     rig = {"left": asdict(r.rig.left), "right": asdict(r.rig.right), "R": r.rig.R.tolist(), "b": r.rig.b.tolist()}
     header = _HEADER | {"name": r.name, "kind": r.kind, "rig": rig, "models": asdict(r.models)}
+    header["truth_noise"] = asdict(r.truth_noise)
     arrays: dict[str, Any] = {"header": json.dumps(header), "numbers": np.array([f.number for f in r], np.int64)}
     arrays |= {"stamps": r.stamps, "rows": np.concatenate(rows), "pixels": np.concatenate(pixels)}
     revisions = [frame.revision for frame in r]
@@ -78,8 +79,7 @@ def load_recording(path: str | Path) -> Recording:
     content = read_bytes(path, _LARGEST, expected="a recording, which `slam run --record FILE.npz` leaves")
     if content.startswith(b"surf-stereo-slam map"):
         raise SequenceError(f"{path}: a saved map, which a run starts in with --map, no recording")
-    members = unpack(content, str(path), SequenceError)
-    arrays = {name.removesuffix(".npy"): array(data, name, str(path), SequenceError) for name, data in members.items()}
+    arrays = unpack(content, str(path), error=SequenceError)
     try:
         return _recording(arrays)
     except KeyError as error:
@@ -110,7 +110,8 @@ def _recording(arrays: dict[str, np.ndarray]) -> Recording:
         raise SequenceError("its name is no text")
     truth = Trajectory(arrays["truth_stamps"], arrays["truth_poses"]) if "truth_stamps" in arrays else None
     frames = _frames(arrays, rig)
-    return Recording(header["name"], rig, EstimatorModels(**models), frames, truth, kind=header["kind"])
+    noise = TruthNoise(**header.get("truth_noise", {}))
+    return Recording(header["name"], rig, EstimatorModels(**models), frames, truth, noise, kind=header["kind"])
 
 
 def _frames(arrays: Mapping[str, np.ndarray], rig: StereoRig) -> tuple[RecordedFrame, ...]:
@@ -184,6 +185,7 @@ class Recording:
         models: noise, priors and motion that the run assumed.
         frames: what was given, frame by frame; their stamps increase.
         ground_truth: the left camera's true path, where it is known.
+        truth_noise: how far it may be off.
         kind: of motion, which chooses a back end's default options.
 
     Raises:
@@ -196,6 +198,7 @@ class Recording:
     models: EstimatorModels
     frames: tuple[RecordedFrame, ...]
     ground_truth: Trajectory | None = None
+    truth_noise: TruthNoise = field(default_factory=TruthNoise)
     warnings: list[str] = field(default_factory=list)
     kind: str = "handheld"
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.evaluation.consistency import EXACT, PIXELS_ALONE
+from slam.evaluation.consistency import BEFORE, EXACT, PIXELS_ALONE
 from slam.evaluation.metrics import chi_square_band
 
 _SCALES = {"mm": 1e3, "%": 100.0}  # units in which people see metres and shares
@@ -147,6 +147,8 @@ def figures(summary: Mapping[str, Any]) -> dict[str, float]:
         found["tracked"] = _measured(summary) / frames
     followed = bool((summary.get("status") or {}).get("tracked"))
     found[DOUBTED] = float(bool(summary.get("doubt")) or (frames > 1 and not followed))
+    if truth_is_exact(summary):
+        found["exact_truth"] = 1.0
     if ratios := _ratios(found):
         found["ratio"] = next(iter(ratios.values()))
     if not followed:  # poses that are the motion model's have no loops, path or σ
@@ -183,6 +185,12 @@ def facts(summary: Mapping[str, Any], brief: bool = False) -> str:
     doubt = "do not trust this path, see the run's warnings" if summary.get("doubt") else ""
     covariances = verdict_of_run(summary).partition(":" if brief else " (")[0]
     return "; ".join(filter(None, [doubt, *words, covariances]))
+
+
+def truth_is_exact(summary: Mapping[str, Any]) -> bool:
+    """Whether the true path, other than a world's, is given without errors of its own."""
+    truth = summary.get("truth")
+    return truth is not None and not any(truth.values()) and summary.get("format") != "synthetic"
 
 
 def _measured(summary: Mapping[str, Any]) -> int:
@@ -225,6 +233,8 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     band = f"({low:.2f} to {high:.2f} in 95 % of {of})"
     if exact:
         others.append("they count errors of the calibration, and this world's cameras have none")
+    if found.get("exact_truth"):
+        others.append("the true path is taken as exact")
     if found.get("pixels_alone"):
         others.append("they count pixel noise alone, and no errors of the calibration")
     return "; ".join([f"covariances {word}: {times} {band}", *others])
@@ -233,6 +243,8 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
 def verdict_of_run(summary: Mapping[str, Any]) -> str:
     """`verdict` on a run by its summary, with what it leaves out; empty where no true path is known."""
     text, honest = verdict(figures(summary)), summary.get("consistency") or {}
+    if not text and summary.get("truth_doubt"):
+        return "covariances are not judged: the true path looks wrong, see the run's warnings"
     doubtful = {over: share for over in _NEES.values() if (share := honest.get(f"doubtful truth {over}"))}
     if not text and not honest.get("dof"):
         return ""
@@ -245,6 +257,8 @@ def verdict_of_run(summary: Mapping[str, Any]) -> str:
         why = (
             "they are singular" if honest.get("singular covariances")
             else "the true path is doubtful, as where it was interpolated over a gap" if doubtful
+            else f"the true path begins {honest[BEFORE]:.0f} frames after the first, and what they say of the motion "
+            "since then is less than what they say of its begin" if honest.get(BEFORE)
             else "they leave none for the motion between two poses, as where a back end claims the same one for every "
             "frame"
         )  # fmt: skip

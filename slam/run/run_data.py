@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.errors import SlamError
+from slam.errors import SlamError, one_line
 from slam.evaluation.consistency import by_mounting
 from slam.evaluation.metrics import associate
 from slam.evaluation.summary import rotation_errors
@@ -19,7 +19,6 @@ from slam.evaluation.truth_error import interpolated, truth_covariances
 from slam.files import read_object, read_text
 from slam.geometry.se3 import Array, adjoint, inverse, transform
 from slam.geometry.trajectory import Trajectory, TruthNoise, alignment
-from slam.naming import printable
 from slam.run.schema import OLD_LANDMARKS, STAGES
 
 _TURNED = np.radians(1.0)  # how far the axes of a recorded truth are turned against the camera's, about
@@ -58,7 +57,9 @@ class RunData:
         if not folder.exists():
             raise SlamError(f"{folder}: there is no such folder")
         if not (folder / "landmarks.csv").exists():
-            raise SlamError(f"{folder}: not the folder of a finished run: there is no landmarks.csv")
+            below = " ".join(sorted(str(path.parent) for path in folder.glob("*/landmarks.csv")))
+            hint = f"; below it are some: {below}" if below else ": there is no landmarks.csv"
+            raise SlamError(f"{folder}: not the folder of a finished run{hint}")
         try:
             return cls._read(folder, name)
         except (KeyError, IndexError, ValueError, TypeError, OverflowError, csv.Error) as error:
@@ -83,7 +84,7 @@ class RunData:
         summary = read_object(folder / "summary.json") if (folder / "summary.json").exists() else {}
         noise: dict[str, Any] = {key: float(value) for key, value in summary.get("truth", {}).items()}
         return cls(
-            name=printable(name),
+            name=one_line(name),
             online=Trajectory.read_tum(folder / "trajectory.txt"),
             final=final,
             ids=_numbers(landmarks, "id")[:, 0].astype(np.int64),
@@ -95,8 +96,8 @@ class RunData:
             status=[row["status"] for row in frames],
             milliseconds={stage: _numbers(frames, f"ms_{stage}")[:, 0] for stage in STAGES},
             truth=Trajectory.read_tum(truth) if truth.exists() else None,
-            sequence=printable(str(config["sequence"])),
-            backend=printable(str(config["backend"])),
+            sequence=one_line(str(config["sequence"])),
+            backend=one_line(str(config["backend"])),
             folder=folder,
             truth_noise=TruthNoise(**noise),
             truth_is_exact=config["format"] == "synthetic",

@@ -19,7 +19,7 @@ from slam.errors import SlamError, one_line, text_of
 from slam.evaluation.objects import labels_in_images, score_for
 from slam.evaluation.summary import with_truth
 from slam.files import remove_file
-from slam.geometry.trajectory import Trajectory
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.input.features import Rectification
 from slam.interfaces import Frontend
 from slam.outputs import require_outputs
@@ -227,6 +227,7 @@ class _Run:
                 attempt(files.write_landmarks, estimate, record.seen, record.last_seen, getattr(system, "atlas", None))
             found = attempt(results_of, sequence, system, record, final or Trajectory.empty(), score)
             summary |= found or {}
+            summary["warnings"] += filter(None, [summary.get("truth_doubt")])
         summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # nothing else is random
         summary["versions"] = versions()
         attempt(write_json, out / "summary.json", summary)
@@ -246,8 +247,9 @@ class _Run:
             logger.warning("%s: not written: %s; what is recorded is for one", path, took_over)
             remove_file(path)  # of an earlier run
             return
-        truth, frames = sequence.ground_truth, tuple(self.tape)
-        save_recording(Recording(sequence.name, sequence.rig, models, frames, truth, kind=sequence.kind), path)
+        truth, noise = sequence.ground_truth, getattr(sequence, "truth_noise", TruthNoise())
+        given = sequence.name, sequence.rig, models, tuple(self.tape), truth, noise
+        save_recording(Recording(*given, kind=sequence.kind), path)
 
     def _tracking(self) -> dict[str, Any]:
         """The part of the summary on the tracking, which is known of every run."""

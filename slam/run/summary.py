@@ -20,6 +20,7 @@ from slam.input.warnings import REPEATED
 from slam.interfaces import Backend, ConsideringBackend
 from slam.run.recording import Recording
 from slam.run.schema import STAGES
+from slam.run.truth_check import truth_doubt
 from slam.runtime.compilation import compile_clock
 from slam.sequences import Sequence
 from slam.sequences.live import LiveFrames
@@ -28,6 +29,8 @@ from slam.third_party import checked, named_failures
 from slam.tracks.step import HIDDEN
 
 logger = logging.getLogger("slam.run")
+
+_DISAGREE = 0.1  # of a path's length, by which two estimates of its last pose cannot differ
 
 
 @dataclass(eq=False)
@@ -122,12 +125,22 @@ def results_of(
         logger.warning(
             "the back end's trajectory() lacks %d of %d frames: it needs a pose for each", missing, len(path)
         )
+    if len(final) and final.stamps[-1] == path.stamps[-1]:
+        apart = float(np.linalg.norm(final.positions[-1] - path.positions[-1]))
+        if apart > _DISAGREE * path.length:
+            logger.warning("the back end's estimate() and trajectory() are %.3g m apart in the last frame", apart)
     none = int((~are_covariances(np.array(record.covariances[1:]).reshape(-1, 6, 6))).sum())
     if none:
         logger.warning(
             "the back end claims a singular covariance for %d of %d poses: it is no uncertainty", none, len(path)
         )
     online, steps = path.select(measured), np.diff(path.positions, axis=0)
+    truth, noise = sequence.ground_truth, getattr(sequence, "truth_noise", TruthNoise())
+    doubt, wrong = "", False
+    if truth is not None and noise == TruthNoise() and sequence.format != "synthetic":  # it is taken as exact
+        doubt, wrong = truth_doubt(online, truth)
+    if doubt:
+        logger.warning("%s", doubt)
     speeds = np.linalg.norm(steps, axis=1) / np.diff(path.stamps)
     common = [record.common[row] for row in np.flatnonzero(measured)]
     found: dict[str, Any] = {
@@ -143,14 +156,15 @@ def results_of(
         },
         "consistency": {
             "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
-            **consistency(online, np.array(record.covariances)[measured], sequence, common),
+            **({} if wrong else consistency(online, np.array(record.covariances)[measured], sequence, common)),
         },
     }
     if none:
         found["consistency"]["singular covariances"] = none
-    noise: TruthNoise | None = getattr(sequence, "truth_noise", None)
-    if found["accuracy"]["online"] and noise is not None:  # for the picture's band, which is that of the verdict
+    if found["accuracy"]["online"]:  # for the picture's band, which is that of the verdict
         found["truth"] = asdict(noise)
+    if doubt:
+        found["truth_doubt"] = doubt
     if isinstance(system, StereoSlam):
         values = getattr(sequence, "values", None)  # of a world: with recordings nobody knows
         if "mean NEES" in found["consistency"] and system.config.self_calibration.enabled and values is not None:

@@ -124,7 +124,7 @@ class Viewer:
 
 def outputs(target: str | None, option: str) -> list[Output]:
     """The file that a `Viewer` writes; none where it opens a window, or there is none."""
-    return [] if target in (None, LIVE) else [Output(Path(target), option, makes_folder=True)]
+    return [] if target in (None, LIVE) else [Output(Path(target), option)]
 
 
 def view_run(folder: Path, target: str, overwrite: bool = False) -> None:

@@ -26,19 +26,11 @@ from types import CodeType, SimpleNamespace
 from typing import Any
 
 import numpy as np
-
-from slam.errors import ConfigurationError
-
-try:
-    from numba import njit
-    from numba.core import event
-    from numba.core.codegen import JITCodeLibrary
-    from numba.core.compiler import Compiler
-    from numba.core.types.misc import unliteral
-except ValueError as error:
-    if not any(name.startswith("NUMBA_") for name in os.environ):
-        raise
-    raise ConfigurationError(f"numba cannot be loaded; one of its variables NUMBA_… is wrong: {error}") from error
+from numba import njit
+from numba.core import event
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
+from numba.core.types.misc import unliteral
 
 _LOG = logging.getLogger(__name__)
 _ROOMS = ("slam.", "frontends.", "backends.")

@@ -30,6 +30,15 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+_ahead = threading.local()  # of a thread that works ahead: `busy` is set while the thread that it works for is so too
+
+
+def free_cores() -> int:
+    """Number of cores for the work of this thread: one less where it works ahead of another that is busy itself."""
+    busy = getattr(_ahead, "busy", None)
+    return max(1, available_cores() - (busy is not None and busy.is_set()))
+
+
 @lru_cache(maxsize=1)
 def _blas(modules: int) -> list[LibController]:
     """The BLAS libraries that are loaded; looked up again whenever the number of `modules` has changed."""
@@ -105,17 +114,19 @@ def prefetch(items: Iterable[T], depth: int = 2) -> Iterator[T]:
     An exception of the iterator is raised where its item would have come. The thread ends with the generator: after its
     last item, when it is closed, or with the program, if an exception left the generator half used.
     """
-    iterator, end = iter(items), object()
-    pool = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
+    iterator, end, busy = iter(items), object(), threading.Event()
+    pool = ThreadPoolExecutor(1, "prefetch", lambda: setattr(_ahead, "busy", busy))
     try:
         ahead: deque[Future[Any]] = deque(pool.submit(next, iterator, end) for _ in range(depth))
         while True:
+            busy.clear()
             while not ahead[0].done():  # a signal that comes just before the wait takes effect at the next look
                 wait([ahead[0]], _LOOK)
             item = ahead.popleft().result()
             if item is end:
                 return
             ahead.append(pool.submit(next, iterator, end))
+            busy.set()
             yield item
     finally:
         pool.shutdown(cancel_futures=True)

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
+import numpy as np
+
 from slam import registry
 from slam.errors import (
     ConfigurationError,
@@ -41,6 +43,8 @@ __all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence"
 _LOOKED_AT = 500  # entries below a folder that is no sequence, at each of so many levels
 _LEVELS = 4
 _LISTED = 6  # sequences below a folder
+_SPARSE = 0.5  # [s] between true poses, from which on their unit is asked for
+_MOST = 0.95  # share of images with a true pose, below which a line says how many
 _NEAR = 0.02  # [s] of a true pose's stamp to an image's, as `slam.evaluation.metrics.associate` has it
 
 
@@ -143,17 +147,19 @@ def _open_folder(text: str, format: str | None, quiet: bool) -> RecordedSequence
 def _truth(path: Path, stamps: Array, lines: list[str]) -> Trajectory:
     """The left camera's true path in TUM's form; SlamError where it is none, or of other times than the images.
 
-    A line is added where most images have none.
+    A line is added where some images have none.
     """
     truth = require_truth(Trajectory.read_tum(path), path)
     near = int((pair(stamps, truth.stamps, _NEAR) >= 0).sum())
-    if 0 < 2 * near < len(stamps):
-        lines.append(
-            f"{path}: {near} of {len(stamps)} images have a true pose within {_NEAR:g} s: the others are not judged"
-        )
+    step = float(np.median(np.diff(truth.stamps))) if len(truth) > 1 else 0.0
+    sparse = f"; true poses are {step:.3g} s apart: are their times in seconds?" if step > _SPARSE else ""
     if not near:
         ends = (f"{times[0]:.3f} to {times[-1]:.3f} s" for times in (truth.stamps, stamps))
-        raise SequenceError(f"{path}: no pose is within {_NEAR:g} s of an image: {', images are from '.join(ends)}")
+        raise SequenceError(
+            f"{path}: no pose is within {_NEAR:g} s of an image: {', images are from '.join(ends)}{sparse}"
+        )
+    if near < _MOST * len(stamps):
+        lines.append(f"{path}: {near} of {len(stamps)} images have a true pose, the others are not judged{sparse}")
     return truth
 
 

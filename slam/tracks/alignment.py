@@ -39,7 +39,7 @@ def align(
     """
     landmarks.patches[landmarks.unseen > _FORGOTTEN] = None
     at = landmarks.rows(matches.ids)
-    usable = landmarks.has_patch[at]
+    usable = landmarks.has_patch(at)
     if matches.T_world_left is None or features.images is None or not usable.any():
         return features
     rows, at = matches.rows[usable], at[usable]
@@ -71,8 +71,9 @@ def take_patches(
 
     Raises SlamError where the front end returns no patches, or not one for each landmark.
     """
-    at = np.flatnonzero((landmarks.ids >= 0) & ~landmarks.has_patch)
+    at = np.flatnonzero(landmarks.ids >= 0)
     at = at[isin(landmarks.ids[at], seen.ids)]
+    at = at[~landmarks.has_patch(at)]
     if features.images is None or not len(at):
         return
     rows, sizes = seen.rows_of(landmarks.ids[at]), {"n": len(at)}

@@ -64,10 +64,17 @@ def match_everywhere(
     descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures, d_match: float, ratio: float,
     allowed: BoolArray | None = None,
 ) -> Matches:  # fmt: skip
-    """Recognise tracks (M, D) by descriptor alone, wherever they lie in the image, or in pairs `allowed` (M, N)."""
-    allowed = np.ones((0, 0), bool) if allowed is None else np.ascontiguousarray(allowed)
-    products, limits = descriptors @ features.descriptors.T, (np.float32(d_match), np.float32(ratio))
-    best = mutual_best(products, allowed, laplacian, features.laplacian, *limits)
+    """Recognise tracks (M, D) by descriptor alone, wherever they lie in the image, or in pairs `allowed` (M, N).
+
+    Only what has the same sign of the Laplacian is compared: half of the pairs.
+    """
+    best, limits = np.full(len(descriptors), -1), (np.float32(d_match), np.float32(ratio))
+    for sign in (-1, 0, 1):
+        rows, columns = (np.flatnonzero(signs == sign) for signs in (laplacian, features.laplacian))
+        if len(rows) and len(columns):
+            some = np.ones((0, 0), bool) if allowed is None else allowed[np.ix_(rows, columns)]
+            found = mutual_best(descriptors[rows] @ features.descriptors[columns].T, some, *limits)
+            best[rows] = np.where(found < 0, -1, columns[found])
     rows = np.flatnonzero(best >= 0)
     return Matches(rows, best[rows])
 
@@ -124,11 +131,11 @@ def best_pairs(rows, columns, distance, allowed, count, size, d_match, ratio, go
 
 
 @kernel
-def mutual_best(products, allowed, signs, feature_signs, d_match, ratio):
+def mutual_best(products, allowed, d_match, ratio):
     """The features (N,) that belong to tracks as in `best_pairs`, −1 for none, wherever they lie.
 
-    Given are the inner products of descriptors, tracks by features (N, M), which pairs are `allowed` (N, M; all where
-    that is empty), and both signs of the Laplacian.
+    Given are the inner products of descriptors, tracks by features (N, M), and which pairs are `allowed` (N, M; all
+    where that is empty).
     """
     count, far = len(products), np.float32(-np.inf)
     best, distance = np.full(count, -1, np.intp), np.empty(count, np.float32)
@@ -137,7 +144,7 @@ def mutual_best(products, allowed, signs, feature_signs, d_match, ratio):
         first = second = far
         for m in range(products.shape[1]):
             p = products[n, m]
-            if p > second and signs[n] == feature_signs[m] and (allowed.size == 0 or allowed[n, m]):
+            if p > second and (allowed.size == 0 or allowed[n, m]):
                 second = min(p, first)
                 if p > first:
                     first, best[n] = p, m

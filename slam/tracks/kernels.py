@@ -77,10 +77,10 @@ def census(
             continue
         for other in range(len(rows)):
             if (
-                in_image[other] and gives_way(seen, rows, n, other)
+                in_image[other] and _gives_way(seen, rows, n, other)
                 and abs(uv[n, 0] - uv[other, 0]) <= _SAME_PIXELS and abs(uv[n, 1] - uv[other, 1]) <= _SAME_PIXELS
-                and distance(local[n], local[other]) < same_distance
-                and signs[row] == signs[rows[other]] and distance(looks[row], looks[rows[other]]) < same_look
+                and _distance(local[n], local[other]) < same_distance
+                and signs[row] == signs[rows[other]] and _distance(looks[row], looks[rows[other]]) < same_look
             ):  # fmt: skip
                 going[n] = True
                 break
@@ -90,8 +90,8 @@ def census(
             place += 1
             if abs(feature_uv[f, 1] - uv[n, 1]) <= _SAME_PIXELS and feature_signs[f] == signs[row] and not known[f]:
                 same = abs(points[f, 2] - local[n, 2]) < SIGMAS * sigma[f]
-                same = same or distance(points[f], local[n]) < same_distance
-                known[f] = same and distance(feature_looks[f], looks[row]) < same_look
+                same = same or _distance(points[f], local[n]) < same_distance
+                known[f] = same and _distance(feature_looks[f], looks[row]) < same_look
     for n in range(len(rows)):
         going[n] = going[n] or (replaceable and _undetected(counts, rows[n], newest, kept))
     _thin_out(rows, counts, seen_from, positions, kept[0], kept[4], going)
@@ -99,13 +99,13 @@ def census(
 
 
 @helper
-def gives_way(seen, rows, one, other):
+def _gives_way(seen, rows, one, other):
     """Whether of two landmarks the one goes: it was seen less, or as often and is younger."""
     return seen[rows[one]] < seen[rows[other]] or (seen[rows[one]] == seen[rows[other]] and one > other)
 
 
 @helper
-def distance(a, b):
+def _distance(a, b):
     """Of two vectors."""
     total = (a[0] - b[0]) * (a[0] - b[0])
     for i in range(1, len(a)):
@@ -167,10 +167,10 @@ def _thin_out(rows, counts, seen_from, positions, erase_missed, spacing, going):
     gone, reach = np.zeros(len(rows), np.bool_), np.zeros(len(rows))
     for n in range(len(rows)):
         gone[n] = unseen[rows[n]] > erase_missed and np.isfinite(seen_from[rows[n], 0])
-        reach[n] = spacing * distance(positions[n], seen_from[rows[n]])
+        reach[n] = spacing * _distance(positions[n], seen_from[rows[n]])
     for n in range(len(rows)):
         if not (gone[n] and unseen[rows[n]] <= 2 * erase_missed and last_seen[rows[n]] >= 0):
             continue
         for other in range(len(rows)):
-            if gone[other] and other != n and distance(positions[n], positions[other]) < min(reach[n], reach[other]):
-                going[n if gives_way(seen, rows, n, other) else other] = True
+            if gone[other] and other != n and _distance(positions[n], positions[other]) < min(reach[n], reach[other]):
+                going[n if _gives_way(seen, rows, n, other) else other] = True

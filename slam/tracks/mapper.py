@@ -69,7 +69,9 @@ class Mapper:
         going |= isin(tracks.ids[rows], step.labels.landmarks)
         erased = tracks.ids[rows[going]]
         tracks.erase_landmarks(rows[going])
-        if len(tracks.mapped) < MINIMAL_POINTS or step.tracking.may_add(self.config.restart_after):
+        # From an unknown pose nothing is added, unless the place is not in the map.
+        known_pose = not step.tracking.unmeasured or step.tracking.in_unknown_place(self.config.restart_after)
+        if known_pose or len(tracks.mapped) < MINIMAL_POINTS:
             for taken in (step.matches.rows, step.labels.moving, step.labels.undecided):
                 known[taken] = True
             step = self._add(backend, step, view, ~known)

@@ -105,10 +105,6 @@ class TrackingState:
         """Whether the camera has just seen `restart_after` frames of a place that is not in the map."""
         return self.showed_enough and self.unknown % restart_after == 0
 
-    def may_add(self, restart_after: int) -> bool:
-        """Whether new landmarks may join the map: not while the pose is unknown, unless the place is not in the map."""
-        return not self.unmeasured or self.in_unknown_place(restart_after)
-
 
 @dataclass(frozen=True, eq=False)
 class LandmarkMatches:

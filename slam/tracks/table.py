@@ -78,10 +78,9 @@ class LandmarkTable(Table):
         """Row numbers of ids that are in the map."""
         return np.searchsorted(self.ids, ids)
 
-    @property
-    def has_patch(self) -> BoolArray:
-        """Which have a patch (N,)."""
-        return np.asarray(self.patches != np.array(None), bool)
+    def has_patch(self, rows: IndexArray) -> BoolArray:
+        """Which of the rows (K,) have a patch."""
+        return np.array([patch is not None for patch in self.patches[rows]], bool)
 
     def long_out_of_view(self, after: int) -> BoolArray:
         """Which (N,) were outside of the image for `after` frames, or are of an earlier run."""

@@ -250,7 +250,7 @@ def startup(values: Mapping[str, Any]) -> Parts:
     layout, floor = values["layout"], -0.45  # the robot is half a metre tall
     offsets, angles = carried(stamps, np.random.default_rng([layout, 47]), gait=1.1, amount=0.1)
     rectangles = [
-        rectangle(Signs(0.8, 0.6, layout), (-0.4, 0, 0.3), RIGHT, DOWN),
+        rectangle(Signs(0.8, 0.6, "board", layout), (-0.4, 0, 0.3), RIGHT, DOWN),
         rectangle(Material(6.0, 2.5, "plaster", layout), (-3.0, 0.02, floor + 2.5), RIGHT, DOWN),
         rectangle(Material(6.0, 2.0, "carpet", layout, 6), (-3.0, 0.02, floor), RIGHT, BACK),
     ]

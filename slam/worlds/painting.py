@@ -36,7 +36,7 @@ def paint(texture: Texture, density: float) -> np.ndarray:
     return picture
 
 
-def _paint_material(piece: Material | Signs, density: float) -> np.ndarray:
+def _paint_material(piece: Material, density: float) -> np.ndarray:
     recipe = RECIPES[piece.material]
     rng = np.random.default_rng([piece.seed, 63])
     density *= recipe.detail

@@ -104,6 +104,7 @@ class TruthImages(NamedTuple):
     objects: np.ndarray  # object (H, W) int32; 0 for the still world, and where nothing is
 
 
+@lru_cache(maxsize=1)
 def truth_images(world: World, frame: int) -> TruthImages:
     """Depth and objects in one frame's left image, at the pixels' centres, also of a camera with distortion."""
     lens, bodies = Lens.of(world.rig.left, 1), world.T_world_body(frame)

@@ -52,7 +52,6 @@ class WorldSequence:
         self.faults = faulty_frames(values, len(world), values["seed"])
         self._kept = np.flatnonzero(~self.faults["drop"])
         self.stamps: Array = world.stamps[self._kept]
-        self._last_truth: tuple[int, TruthImages] | None = None
         self._images: list[StereoFrame] = []
 
     @cached_property
@@ -129,12 +128,9 @@ class WorldSequence:
         return Recorder(self.world, self.values, self.faults)
 
     def _truth(self, k: int) -> TruthImages:
-        """True depth and objects of frame k; the last frame's are kept."""
-        if self._last_truth is None or self._last_truth[0] != k:
-            from slam.worlds.recorder import truth_images
+        from slam.worlds.recorder import truth_images
 
-            self._last_truth = k, truth_images(self.world, self.source(k))
-        return self._last_truth[1]
+        return truth_images(self.world, self.source(k))
 
     def source(self, k: int) -> int:
         """The world's frame that is frame k of the recording."""

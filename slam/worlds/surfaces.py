@@ -66,13 +66,8 @@ class Facade:
 
 
 @dataclass(frozen=True)
-class Signs:
-    """A white board with four rows of six signs: features known beforehand."""
-
-    width: float  # [m]
-    height: float  # [m]
-    seed: int
-    material: str = "board"
+class Signs(Material):
+    """A board with four rows of six signs: features known beforehand."""
 
     def marks(self) -> Array:
         """The signs."""

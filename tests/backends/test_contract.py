@@ -63,7 +63,8 @@ def test_a_guarded_back_end_keeps_count_of_its_additional_methods_and_gives_noth
     assert registry.options_of(Guarded, RIG) == {"mine": (3, Guarded)}
     backend, z = Guarded(RIG), RIG.project_stereo(np.array([[0.0, 0.0, 5.0]]))[0]
     seen = Observations(np.array([3]), z[:, :2], z[:, [2, 1]])
-    backend.insert(np.array([3]), np.array([[0.0, 0.0, 5.0]]), 1e-2 * np.eye(3)[None])
+    backend.insert(np.array([3, 5]), np.array([[0.0, 0.0, 5.0]] * 2), 1e-2 * np.tile(np.eye(3), (2, 1, 1)))
+    backend.remove([5])  # a map may change before the start
     backend.predict(0.0)
     assert backend.positions([3]).shape == (1, 3)  # ids in any form
     backend.predict_at_rest(1.0)

@@ -44,7 +44,7 @@ def test_settings_reach_their_place():
         ("models.pixel_sigma=abc", "models.pixel_sigma must be a number, got 'abc'"),
         ("association.align=often", "association.align must be true or false, got 'often'"),
         ("models.T_world_left=[1]", "models.T_world_left must be a (4, 4) pose"),
-        ("models.pixel_sigma=-1", "pixel_sigma must be positive"),
+        ("models.pixel_sigma=-1", "pixel_sigma must be finite, from 0.001 to 1000"),
         ("backend.rig=3", "backend.rig: the system gives this"),
         ("map=3", "is a section"),
         ("association.d_match=[NaN, 0.2]", "d_match must be finite"),

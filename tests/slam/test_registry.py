@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from slam import registry
-from slam.errors import ConfigurationError, UnknownNameError
+from slam.errors import UnknownNameError
 
 ROOT = Path(__file__).resolve().parents[2]
 _RESOLVE = "from slam import registry; registry.resolve({role!r}, {name!r})"
@@ -57,36 +57,3 @@ def test_a_back_end_by_its_module_in_the_working_folder(tmp_path, monkeypatch):
             registry.resolve("backends", name)
     with pytest.raises(UnknownNameError, match=f"looked for in {tmp_path}, where `slam` runs"):
         registry.resolve("backends", "no_module_of_this_name:Mine")
-
-
-FOREIGN = """
-class Nothing:
-    def __init__(self, rig): pass
-class Raises:
-    def __init__(self, rig): raise RuntimeError("no way")
-class Quits:
-    def __init__(self, rig): raise SystemExit(0)
-class Plain:
-    def __init__(self, rig, models=None, window=5): pass
-"""
-
-
-def test_modules_and_classes_of_elsewhere_that_fail_get_one_line(tmp_path, monkeypatch):
-    (tmp_path / "foreign_classes.py").write_text(FOREIGN)
-    (tmp_path / "module_that_raises.py").write_text("\nundefined\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    with pytest.raises(UnknownNameError, match=r"NameError: .*undefined.* \(module_that_raises.py, line 2\)"):
-        registry.create("backends", "module_that_raises:Mine", "rig")
-    (tmp_path / "module_that_lacks.py").write_text("\nimport nosuch\n")
-    with pytest.raises(UnknownNameError, match=r"No module named 'nosuch' \(module_that_lacks.py, line 2\)"):
-        registry.create("backends", "module_that_lacks:Mine", "rig")
-    cases = {
-        "Nothing": ({}, "is none: it lacks predict, update"),
-        "Raises": ({}, r"cannot be created: RuntimeError: no way \(foreign_classes.py, line 5\)"),
-        "Quits": ({}, "cannot be created: SystemExit"),
-        "Plain": ({"windo": 3}, "cannot .*'windo'.*; its options are window"),
-    }
-    for name, (options, words) in cases.items():
-        with pytest.raises(ConfigurationError, match=words):
-            registry.create("backends", f"foreign_classes:{name}", "rig", **options)

@@ -141,7 +141,7 @@ def test_other_files_and_versions_are_refused(tmp_path):
         with pytest.raises(SlamError, match=f"version '{version.decode()}'.*version 7"):
             decode(data, "a.map")
     with pytest.raises(SlamError, match="cannot be written"):
-        save_map(tmp_path / "no" / "folder.map", some_map())
+        save_map(tmp_path / "text" / "folder.map", some_map())
 
 
 # --- keyframes and loops in it ---

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import os
-import re
 import subprocess
 import sys
 
@@ -56,25 +54,3 @@ def test_a_folder_that_is_missing_or_empty(slam_command, tmp_path):
 )
 def test_unknown_names_and_keys(slam_command, euroc, tmp_path, arguments, words):
     fails_with_one_line(slam_command("run", euroc, "--out", tmp_path / "out", *arguments), *words)
-
-
-@pytest.mark.slow
-def test_wrong_variables_of_libraries_end_in_one_line_or_do_no_harm(tmp_path):
-    run = ["run", "synthetic:desk?frames=3&width=160&height=120", "--out", tmp_path / "out", "--quiet"]
-    fails_with_one_line(in_a_new_process(*run, env={**os.environ, "NUMBA_NUM_THREADS": "0"}), "NUMBA_")
-    done = in_a_new_process(*run, env={**os.environ, "MPLBACKEND": "nonsense"})
-    assert done.returncode == 0, done.stderr
-    assert list((tmp_path / "out").glob("*.png"))
-
-
-@pytest.mark.slow
-def test_the_demo_shows_the_box_and_covariances_that_hold(slam_command, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    done = slam_command("demo", "--frames", "60", "--out", "demo")
-    assert done.returncode == 0, done.stderr
-    words = " ".join(done.stdout.split())
-    assert words.count("covariances hold: from the start") == 3
-    assert re.search(r"moving bodies found 1 1 1 .* motion of a body, error \[mm\] \d", words)
-    assert re.search(r"Open first: \S*summary\.png; then \S*frame\.png, the box in the image", words)
-    assert all((tmp_path / "demo" / name).stat().st_size > 10_000 for name in ("summary.png", "frame.png"))
-    assert max(map(len, (done.stdout + done.stderr).splitlines())) <= 80

@@ -1,16 +1,13 @@
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from slam.config import SystemConfig
-from slam.errors import SlamError
 from slam.geometry.trajectory import TruthNoise
 from slam.run.options import RunOptions
-from slam.run.plots import KINDS
 from slam.run.plots import plot_folders as plot_runs
 from slam.run.run_data import RunData, pose_errors
 from slam.run.runner import run
@@ -28,39 +25,12 @@ def runs(tmp_path_factory):
     return root
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_runs_with_and_without_truth_are_drawn(runs, tmp_path, kind):
-    shutil.copytree(runs / "a", tmp_path / "a")
-    (tmp_path / "a" / "truth.txt").unlink()
-    without = tmp_path / "a"
-    for name, folders in (("a.png", [without]), ("b.pdf", [without, runs / "b"]), ("c.svg", [runs / "b"])):
-        plot_runs(folders, tmp_path / name, kind)
-        assert (tmp_path / name).stat().st_size > 1000
-
-
 def test_a_path_that_is_one_dot_is_drawn_without_a_word(tmp_path, caplog):
     config = SystemConfig.for_kind("handheld")
     run(open_sequence("synthetic:desk?frames=1"), RunOptions("ekf", "surf", config, tmp_path / "a"))
+    caplog.clear()
     plot_runs([tmp_path / "a"], tmp_path / "a.png", "summary")
     assert not caplog.messages
-
-
-@pytest.mark.parametrize(
-    ("folder", "file", "kind", "words"),
-    [
-        (".", None, "summary", "not the folder of a finished run"),
-        ("a", "a.jpg", "summary", r"a picture is a file \.png, \.pdf or \.svg"),
-        ("a", "a.png", "eror", r"unknown figure 'eror'.*did you mean 'errors'"),
-        ("a", "paper.pdf/a.png", "path", "cannot be written"),
-        ("a", "paper.pdf", "path", "is there already"),
-    ],
-)
-def test_bad_input_is_one_line(runs, tmp_path, folder, file, kind, words):
-    (tmp_path / "paper.pdf").write_text("mine")
-    with pytest.raises(SlamError, match=words):
-        plot_runs([runs / folder], file and tmp_path / file, kind)
-    assert (tmp_path / "paper.pdf").read_text() == "mine"
 
 
 def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(runs):

@@ -43,26 +43,6 @@ def test_a_setting_of_the_program_itself_is_refused():
     require_settable(["map.max_landmarks=300", "backend.lag=8", "frontend.octaves=3", "map.colour=1"], tree, "other")
 
 
-@pytest.mark.parametrize(
-    ("setting", "words"),
-    [
-        (
-            "map.max_landmark=3",
-            "did you mean 'max_landmarks'?); known: target_in_view, max_depth_error, restart_after,",
-        ),
-        ("association.max_landmarks=3", "did you mean 'map.max_landmarks'?); known: align"),
-    ],
-)
-def test_a_mistyped_setting_is_answered_with_those_that_can_be_set(setting, words):
-    with pytest.raises(ConfigurationError) as caught:
-        SystemConfig().with_settings([setting])
-    assert words in str(caught.value)
-    named = str(caught.value).partition("known: ")[2].split(", ")
-    assert all(can_be_set(f"{setting.partition('.')[0]}.{name}") for name in named)
-    with pytest.raises(ConfigurationError, match=r"cannot be set \(did you mean 'features'\?\)"):
-        require_settable(["frontend.feature=3"], SystemConfig().to_json(), "surf")
-
-
 OWN = """
 from dataclasses import dataclass
 from backends.ekf import EkfBackend

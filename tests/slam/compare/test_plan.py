@@ -1,19 +1,15 @@
 from __future__ import annotations
 
-import json
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from slam.commands import compare as command
 from slam.commands.cli import app
-from slam.commands.compare import compare
 from slam.compare.plan import CLOSED_LOOP, Plan
 from slam.compare.sweep import Run
-from slam.compare.tables import caution, groups, sentences
+from slam.compare.tables import groups, sentences
 from slam.errors import ConfigurationError
 from slam.geometry.trajectory import Trajectory
 
@@ -47,36 +43,6 @@ def test_trials_are_paired_and_have_folders_of_their_own():
 def test_bad_plans(arguments, word):
     with pytest.raises(ConfigurationError, match=word):
         Plan(*arguments)
-
-
-def test_back_ends_without_commas_are_told_how_they_are_given(tmp_path):
-    with pytest.raises(ConfigurationError, match="joined by commas: --backends ekf,smoother"):
-        compare(Plan(("synthetic:desk", "smoother"), ("ekf",)), tmp_path / "out")
-
-
-@pytest.mark.parametrize("outcome", ["completed", "failed: SlamError: no"])
-def test_the_time_of_a_comparison_is_told_by_its_first_frames(monkeypatch, outcome):
-    """It was told by a time of a frame from another machine."""
-
-    def run_jobs(jobs, workers, told):
-        ((trial, folder, _),) = jobs
-        assert (trial.seed, trial.stop) == (0, 15 if trial.sequence == WORLDS[1] else 8)
-        times = {"outcome": outcome, "milliseconds": {"total": 100.0, "read": 60.0, "extract": 20.0}}
-        (folder / "result.json").write_text(json.dumps(times))
-
-    monkeypatch.setattr(command, "run_jobs", run_jobs)
-    plan = Plan((WORLDS[1], "/data"), ("ekf", "window"), trials=3, replay=True)
-    whole = 2 * (3 * 50 + 8) * (0.1 + 0.02)  # replay: without images
-    expected = pytest.approx(whole) if outcome == "completed" else None
-    assert command._seconds(plan.every, {WORLDS[1]: 50, "/data": 8}) == expected
-
-
-def test_what_so_many_trials_can_show_is_said():
-    plan = Plan(WORLDS[:1], ("ekf", "smoother", "window"))
-    assert caution(plan, 1).startswith("One trial cannot tell")
-    assert caution(plan, 12).startswith("With 12 trials only a difference of 1.2 times its scatter")
-    assert caution(plan, 2).startswith("2 trials can hardly show any difference")
-    assert caution(replace(plan, backends=("ekf",)), 12) == ""
 
 
 @pytest.mark.parametrize("told", [{}, {"doubted": 1.0}])

@@ -2,37 +2,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-import pytest
 from typer.testing import CliRunner
 
 from slam.commands.cli import app
 from slam.compare import trial
 from slam.compare.plan import REPLAY, Plan, Trial
-from slam.compare.sweep import RUNS, is_done, read_run
+from slam.compare.sweep import RUNS, is_done
 from slam.compare.trial import COMPLETED, keep_result
-from slam.errors import SlamError
 from slam.files import read_object
 from slam.sequences import open_sequence
 from slam.worlds.export import write_euroc
-
-
-@pytest.mark.parametrize("mode", ["closed loop", "replay"])
-def test_a_run_knows_the_kind_of_motion_of_its_sequence(mode, tmp_path, monkeypatch):
-    """Drives were doubted as too fast for a hand."""
-    kinds = []
-
-    def stopped(sequence, options, *others, **more):
-        kinds.append(options.kind)
-        raise SlamError("enough")
-
-    for name in ("run", "run_recording"):
-        monkeypatch.setattr(trial, name, stopped)
-    monkeypatch.setattr(trial, "load_recording", lambda path: path)
-    drive = Trial("synthetic:street?frames=2", "ekf", mode=mode)
-    (tape := tmp_path / "recording.npz").touch()
-    trial.run_trial(drive, tmp_path, None if mode == "closed loop" else tape)
-    assert kinds == ["driving"]
 
 
 def test_what_was_run_with_other_settings_frames_or_versions_is_not_done(tmp_path, monkeypatch):
@@ -47,13 +26,6 @@ def test_what_was_run_with_other_settings_frames_or_versions_is_not_done(tmp_pat
     other = replace(trial, settings=("frontend.features=900",))
     assert not is_done(replace(plan, replay=True), trial, tmp_path)  # there is no recording to replay
     assert not is_done(plan, other, tmp_path) and not is_done(plan, replace(trial, stop=3), tmp_path)
-
-
-def test_a_figure_that_is_no_number_is_none_of_the_run(tmp_path):
-    """A camera that stands has no drift by distance."""
-    trial = Trial("synthetic:desk?frames=5", "ekf")
-    keep_result(trial, tmp_path / RUNS / trial.folder, COMPLETED, {"segment_percent": np.nan, "ate_online_m": 0.1})
-    assert read_run(trial, tmp_path).metrics == {"completed": 1.0, "ate_online_m": 0.1}
 
 
 def test_a_run_that_began_again_has_figures_and_its_cause_and_no_recording(tmp_path):

@@ -96,10 +96,35 @@ def unlike_cameras(turn, *lenses):
     return slam.StereoRig(left, right, R, R.T @ np.array([-0.12, 0.004, 0.002]))
 
 
+def seen_by(image, camera, R):
+    """The image of a camera, turned by R, of what is in an image of `RIG`: where each pixel's ray meets that."""
+    v, u = np.mgrid[:240, :320]
+    rays = np.column_stack([camera.normalise(np.column_stack([u.ravel(), v.ravel()]).astype(float)), np.ones(76800)])
+    uv = np.nan_to_num(RIG.left.project(rays @ R), nan=-1).astype(np.float32).reshape(240, 320, 2)
+    return cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
+
+
+def seen_by_both(left, right, R):
+    """A change of images into what two cameras have of them, the right one turned."""
+    return lambda a, b: (seen_by(a, left, np.eye(3)), seen_by(b, right, R))
+
+
 DISTORTED = unlike_cameras([0.01, 0.02, -0.01], (-0.25, 0.08), (-0.26, 0.08))
 _LENS = PinholeCamera(260.0, 260.0, 159.5, 119.5, 320, 240, "radtan", (-0.37, 0.2, 0.0, 0.0))
 ALIKE = slam.StereoRig(_LENS, _LENS, np.eye(3), np.array([-0.12, 0.0, 0.0]))  # most rows agree to a pixel all the same
 OBLONG = PinholeCamera(300.0, 350.0, 160.0, 120.0, 320, 240)
+PLAIN = [replace(camera, model="none", distortion=()) for camera in (DISTORTED.left, DISTORTED.right)]
+TURNED = unlike_cameras([0.02, 0.12, -0.02], (-0.1, 0.02), (-0.12, 0.02))
+TRANSPOSED = slam.StereoRig(TURNED.left, TURNED.right, TURNED.R.T, TURNED.b)
+OTHER_SIGN = [replace(_LENS, distortion=tuple(-d for d in _LENS.distortion))] * 2
+
+#: Two looks that take turns on a grid of 20 columns.
+_TWO = np.random.default_rng(0).normal(size=(2, 64))
+REPEATED = {
+    "stereo": 0, "laplacian": np.ones(200, np.int8), "scale": np.full(200, 8.0),
+    "uv_left": np.column_stack([10 + 15.0 * (np.arange(200) % 20), 10 + 20.0 * (np.arange(200) // 20)]),
+    "descriptors": (_TWO / np.linalg.norm(_TWO, axis=1, keepdims=True))[np.arange(200) % 2].astype(np.float32),
+}  # fmt: skip
 
 
 def of_size(times):
@@ -172,6 +197,21 @@ SAID = {
         every(3, lambda a, b: tuple(np.where(np.arange(240)[:, None] % 2, x, np.roll(x, 9, 1)) for x in (a, b))), {},
         "rows of the image alternate, as in interlaced video",
     ),
+    # these were taken for images that are rectified twice
+    "transposed rotation": (
+        every(3, seen_by_both(TURNED.left, TURNED.right, TURNED.R)), {"rig": TRANSPOSED},
+        "with the inverse of the calibration's rotation.*is R transposed",
+    ),
+    "distortion of the other sign": (
+        every(3, seen_by_both(*OTHER_SIGN, np.eye(3))), {"rig": ALIKE}, "the sign of the distortion exchanged"
+    ),
+    "undistorted, not rectified": (
+        every(3, seen_by_both(*PLAIN, DISTORTED.R)), {"rig": DISTORTED}, "undistorted, and are again"
+    ),
+    "lenses as calibrated": (every(3, seen_by_both(_LENS, _LENS, np.eye(3))), {"rig": ALIKE}, ""),
+    "repeated pattern": (
+        every(6), REPEATED, "only 0 of 200 features.*the view is a repeated pattern: 200 of them have a look-alike"
+    ),
     "never rectified": (every(3, never_rectified), {}, "were they rectified, as this calibration says"),
 }  # fmt: skip
 
@@ -239,19 +279,6 @@ def test_right_images_of_another_moment_are_doubted(world, late):
         assert ("one moment" in system.doubt) == doubted and bool(system.warnings) == doubted
 
 
-def seen_by(image, camera, R):
-    """The image of a camera, turned by R, of what is in an image of `RIG`: where each pixel's ray meets that."""
-    v, u = np.mgrid[:240, :320]
-    rays = np.column_stack([camera.normalise(np.column_stack([u.ravel(), v.ravel()]).astype(float)), np.ones(76800)])
-    uv = np.nan_to_num(RIG.left.project(rays @ R), nan=-1).astype(np.float32).reshape(240, 320, 2)
-    return cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
-
-
-def seen_by_both(left, right, R):
-    """A change of images into what two cameras have of them, the right one turned."""
-    return lambda a, b: (seen_by(a, left, np.eye(3)), seen_by(b, right, R))
-
-
 def test_swapped_cameras_of_an_unrectified_rig():
     rig = unlike_cameras([0.02, 0.05, -0.03], (-0.1, 0.02), (-0.12, 0.02))
     views = [points_of(image) for image in seen_by_both(rig.left, rig.right, rig.R)(FRAME.left, FRAME.right)]
@@ -261,31 +288,15 @@ def test_swapped_cameras_of_an_unrectified_rig():
     assert bad.swapped
 
 
-def test_a_transposed_rotation_is_named():
-    """It was taken for images that are rectified twice."""
-    rig = unlike_cameras([0.02, 0.12, -0.02], (-0.1, 0.02), (-0.12, 0.02))
-    frames = every(3, seen_by_both(rig.left, rig.right, rig.R))
-    (line,) = lines(frames, rig=slam.StereoRig(rig.left, rig.right, rig.R.T, rig.b))
-    assert "with the inverse of the calibration's rotation" in line and "is R transposed" in line
-
-
 @pytest.mark.parametrize("early", [False, True])
 def test_rows_that_agree_with_the_frame_before_are_of_two_moments(early):
     """They were taken for a rotation that is transposed."""
-    rig = unlike_cameras([0.02, 0.12, -0.02], (-0.1, 0.02), (-0.12, 0.02))
-    see = seen_by_both(rig.left, rig.right, rig.R)
+    see = seen_by_both(TURNED.left, TURNED.right, TURNED.R)
     seen = [see(*(np.roll(image, 7 * k, axis=0) for image in (FRAME.left, FRAME.right))) for k in range(4)]
     moved = [replace(FRAME, index=k, stamp=0.05 * k, left=a, right=b) for k, (a, b) in enumerate(seen)]
     pairs = [replace(a, right=b.right) if early else replace(b, right=a.right) for a, b in itertools.pairwise(moved)]
-    (line,) = lines(pairs, rig=rig)
+    (line,) = lines(pairs, rig=TURNED)
     assert f"to come a frame {'early' if early else 'late'}" in line
-
-
-def test_a_distortion_of_the_other_sign_is_named():
-    """It was taken for images that are rectified twice."""
-    other = [replace(_LENS, distortion=tuple(-d for d in _LENS.distortion))] * 2
-    (line,) = lines(every(3, seen_by_both(*other, np.eye(3))), rig=ALIKE)
-    assert "the sign of the distortion exchanged" in line
 
 
 def test_rounding_is_no_share_of_what_rectification_does():
@@ -296,22 +307,11 @@ def test_rounding_is_no_share_of_what_rectification_does():
     assert share_shown(before, 2 * before, 0.5) == pytest.approx(-1.0)
 
 
-def test_images_undistorted_but_not_rectified_before_are_named():
-    plain = [replace(camera, model="none", distortion=()) for camera in (DISTORTED.left, DISTORTED.right)]
-    said = lines(every(3, seen_by_both(*plain, DISTORTED.R)), rig=DISTORTED)
-    assert ["undistorted, and are again" in line for line in said] == [True]
-
-
 def test_a_distortion_that_is_missing_is_named_before_a_rectification_done_twice(monkeypatch):
     """Raw images with a calibration without their lenses were said to be undistorted twice."""
-    plain = [replace(camera, model="none", distortion=()) for camera in (DISTORTED.left, DISTORTED.right)]
     monkeypatch.setattr(warnings, "pair_geometry", lambda rig, *given: pair_geometry(DISTORTED, *given))
-    (line,) = lines(every(3), rig=slam.StereoRig(*plain, DISTORTED.R, DISTORTED.b))
+    (line,) = lines(every(3), rig=slam.StereoRig(*PLAIN, DISTORTED.R, DISTORTED.b))
     assert "the lenses' distortion is missing in it; or the images were rectified before" in line
-
-
-def test_equal_lenses_that_the_images_do_have_are_left_in_peace():
-    assert lines(every(3, seen_by_both(_LENS, _LENS, np.eye(3))), rig=ALIKE) == []
 
 
 @pytest.mark.parametrize(("baseline", "doubted"), [(120.0, True), (0.00012, True), (0.006, False), (9.0, False)])
@@ -319,15 +319,6 @@ def test_a_baseline_in_another_unit_is_doubted(baseline, doubted):
     rig = slam.StereoRig.from_pinhole(RIG.left.K, baseline=baseline, size=(320, 240))
     said = InputWarnings(rig, models_for("handheld"), 1.5).lines
     assert [f"{baseline:g} m apart" in line for line in said] == [True] * doubted
-
-
-def test_a_repeated_pattern_is_named_as_the_reason():
-    one = np.random.default_rng(0).normal(size=(2, 64))
-    two = (one / np.linalg.norm(one, axis=1, keepdims=True))[np.arange(200) % 2].astype(np.float32)
-    uv = np.column_stack([10 + 15.0 * (np.arange(200) % 20), 10 + 20.0 * (np.arange(200) // 20)])
-    column = np.ones(200)
-    (line,) = lines(every(6), stereo=0, uv_left=uv, descriptors=two, scale=8 * column, laplacian=np.ones(200, np.int8))
-    assert "only 0 of 200 features" in line and "the view is a repeated pattern: 200 of them have a look-alike" in line
 
 
 def test_a_calibration_that_cannot_be_that_of_the_images_leaves_no_path_to_trust():

@@ -38,6 +38,9 @@ def test_a_file_is_whole_or_as_it_was(tmp_path):
     with whole_file(path) as file:
         file.write(b"after")
     assert path.read_text() == "after" and stat.S_IMODE(path.stat().st_mode) == 0o640
+    with whole_file(tmp_path / "new" / "folder" / "b") as file:
+        file.write(b"made")
+    assert (tmp_path / "new" / "folder" / "b").read_text() == "made"
 
 
 def test_a_disk_that_fills_up_half_way(tmp_path, caplog):

@@ -14,7 +14,6 @@ from slam.geometry.se3 import exp
 from slam.models import MotionModel
 from slam.outputs import Output
 from slam.run.outcome import motion_doubt, outcome, scale_doubt
-from slam.run.results import rows
 from slam.run.summary import RunRecord
 
 RIG = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
@@ -23,26 +22,6 @@ RIG = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
 def record(tracked: int, frames: int = 21, features: tuple[int, int] = (200, 150)) -> RunRecord:
     statuses = ["started", *["tracked"] * tracked, *["lost"] * (frames - 1 - tracked)]
     return RunRecord(statuses=statuses, features=[features] * frames)
-
-
-@pytest.mark.parametrize(
-    ("tracked", "words"),
-    [
-        (20, ""), (18, ""), (17, "3 of 21 frames were not tracked"), (10, "10 of 21 frames were not tracked"),
-        (9, "only 10 of 21 frames were tracked"), (1, "only 2 of 21"), (0, "no frame after the first was tracked"),
-    ],
-)  # fmt: skip
-def test_where_more_than_one_in_ten_is_not_tracked_it_is_told_with_the_numbers_of_the_table(tracked, words):
-    """It said "no frame was tracked" below a table with "frames tracked 1 of 20"."""
-    run = record(tracked)
-    said = outcome(run, RIG)
-    assert said.startswith(words) and bool(said) == bool(words)
-    status = {name: run.statuses.count(name) for name in set(run.statuses)}
-    ((label, (text,)),) = rows([{"frames": 21, "status": status}])
-    assert label == "frames tracked" and text.startswith(f"{1 + tracked} of 21")
-    if not tracked:
-        run.statuses[0] = "lost"
-        assert outcome(run, RIG).startswith("no frame was tracked;")
 
 
 AGAIN = "features are found in both images, but not again in the next frame"
@@ -89,16 +68,6 @@ def test_times_that_are_too_short_are_doubted():
     factor = int(said.partition("changes ")[2].split()[0])
     assert factor == pytest.approx(10**1.5, rel=0.3)
     assert "fps=…" in said
-
-
-def test_missing_right_images_are_the_cause_where_most_of_these_frames_have_none():
-    run = record(10, features=(200, 0))
-    run.without_right.extend(range(8, 13))
-    assert "likely cause: 10 of these 10 frames have no right image or follow such" in outcome(run, RIG)
-    assert "calibration" not in outcome(run, RIG)
-    run = record(10)
-    run.without_right.extend(range(5))
-    assert "no right image" not in outcome(run, RIG)
 
 
 def along(step, times=30, **more):

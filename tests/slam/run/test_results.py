@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-from slam.commands.display import print_summary
 from slam.compare.plan import Plan, Trial
 from slam.compare.sweep import Run
 from slam.compare.tables import groups, honesty
@@ -89,19 +86,3 @@ def test_figures_of_bodies_are_means_over_those_that_were_in_view():
     assert found["body_coverage"] == pytest.approx(0.6) and found["body_nees_per_dof"] == pytest.approx(2.0)
     assert found["moving_precision"] == 0.5
     assert "moving_precision" not in figures(summary(1.0) | {"objects": {"features": {"precision": 0.5}, "bodies": {}}})
-
-
-def test_runs_that_are_not_to_be_trusted_are_a_row_of_a_comparison_where_there_are_any(tmp_path):
-    plan, trial = Plan(("synthetic:desk",), ("ekf",)), Trial("synthetic:desk", "ekf")
-    lost = {"status": {"started": 1, "lost": 39}}
-    for doubt in ({}, {"doubt": "rows do not agree"}, lost):
-        found = figures(summary(1.0) | doubt)
-        (group,) = groups(plan, [Run(trial, "completed", found, {}, tmp_path)])
-        assert ("runs not to be trusted [%]" in [metric.title for metric in group.metrics]) == bool(doubt)
-
-
-def test_names_of_back_ends_are_printed_as_they_are(capsys):
-    """`mine:Zero: …` was printed with a picture of the digit."""
-    print_summary([summary(1.0) | {"sequence": "a:fire:[b]", "backend": "mine:Zero"}], [Path("o")])
-    said = capsys.readouterr().out
-    assert "mine:Zero: covariances hold" in said and "a:fire:[b]" in said

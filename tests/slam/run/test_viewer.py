@@ -1,24 +1,12 @@
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 
 from slam.config import SystemConfig
-from slam.errors import SlamError
 from slam.run.options import RunOptions
 from slam.run.runner import run
 from slam.run.viewer import Viewer, view_run
 from slam.sequences import open_sequence
-
-
-def test_without_a_display_one_line_says_what_to_do(monkeypatch):
-    monkeypatch.setattr("slam.run.viewer.import_module", lambda name: SimpleNamespace())
-    monkeypatch.setattr("sys.platform", "linux")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(SlamError, match=r"no display for a window; give a file, such as run\.rrd"):
-        Viewer("live")
 
 
 @pytest.mark.slow

@@ -5,55 +5,58 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
-from slam.runtime.threads import prefetch
+from slam.runtime.threads import free_cores, prefetch
 
 
 def threads() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.name.startswith("prefetch")}
 
 
-def test_an_item_is_made_while_the_one_before_is_used():
-    made = threading.Event()
-
-    def items():
-        yield 0
-        made.set()
-        yield 1
-
-    for item in prefetch(items()):
-        if item == 0:
-            assert made.wait(10)
-
-
-def test_no_more_than_asked_for_is_made_beforehand():
-    before = threads()
-    made = []
+def test_items_are_made_while_the_one_before_is_used_and_no_more_than_asked_for():
+    before, made, third = threads(), [], threading.Event()
 
     def items():
         for k in range(50):
             made.append(k)
+            if k == 2:
+                third.set()
             yield k
 
     work = prefetch(items(), depth=2)
-    assert next(work) == 0
-    assert len(made) <= 5
+    assert next(work) == 0 and third.wait(10) and len(made) <= 5
     work.close()
     assert threads() <= before
 
 
-def test_an_exception_comes_where_its_item_would():
-    before = threads()
+def test_what_is_made_ahead_leaves_a_core_to_a_busy_user(monkeypatch):
+    monkeypatch.setattr("slam.runtime.threads.available_cores", lambda: 4)
+    use, made = threading.Event(), []
 
     def items():
-        yield 1
-        raise ValueError("broken")
+        made.append(free_cores())
+        yield
+        assert use.wait(10)
+        made.append(free_cores())
+        use.clear()
+        yield
 
-    work = prefetch(items())
+    for _ in prefetch(items()):
+        if len(made) == 1:
+            use.set()
+            while len(made) == 1:
+                time.sleep(0.01)
+    assert made == [4, 3] and free_cores() == 4
+
+
+def test_an_exception_comes_where_its_item_would():
+    before = threads()
+    work = prefetch(1 // k for k in (1, 0))
     assert next(work) == 1
-    with pytest.raises(ValueError, match="broken"):
+    with pytest.raises(ZeroDivisionError):
         next(work)
     assert threads() <= before
 
@@ -64,7 +67,7 @@ def test_the_thread_ends_before_the_program_does(source):
     program = f"""
 import atexit, sys, threading
 from types import SimpleNamespace
-from slam.runtime.threads import prefetch
+from slam.runtime.threads import free_cores, prefetch
 from slam.sequences.live import LiveFrames
 
 def endless():

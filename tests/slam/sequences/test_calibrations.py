@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import slam
-from slam.errors import CalibrationError, ConfigurationError, SlamError
+from slam.errors import CalibrationError, ConfigurationError
 from slam.geometry.camera import in_units
 from slam.sequences import open_sequence
 
@@ -287,23 +287,3 @@ def test_faulty_entries(tmp_path: Path, build: SimpleNamespace, change: dict, te
     with pytest.raises(CalibrationError) as error:
         slam.load_rig(tmp_path / "a.yml", size=SIZE)
     assert text in str(error.value) and str(tmp_path / "a.yml") in str(error.value)
-
-
-def test_what_is_no_calibration_is_one_line(tmp_path: Path, two_folders: Path) -> None:
-    camera = "T_BS: [1,0,0,{x}, 0,1,0,0, 0,0,1,0, 0,0,0,1]\nresolution: [64, 48]\nintrinsics: [50, 50, 31, 23]\n"
-    for name, x in (("a", 0.0), ("b", 0.1)):
-        (tmp_path / f"{name}.yaml").write_text(camera.format(x=x))
-    (tmp_path / "0.yaml").write_text("Image_Size: [64, 48]\nfoo_Bar: 1\n")
-    (tmp_path / "1.yaml").write_text("K1: [1]\n")
-    for files, options, words in (
-        ([two_folders / "left"], {}, "no calibration under one of the usual names"),
-        ([two_folders / "calibration.yaml"], {}, r"names no image size: give size=\(width, height\)"),
-        (["a.yaml", "b.yaml"], {"size": (32, 24)}, r"images are 32x24, but .* is for 64x48"),
-        (["0.yaml", "1.yaml"], {}, r"in it: Image_Size, K1, foo_Bar"),
-    ):
-        with pytest.raises(SlamError, match=words):
-            slam.load_rig(*(tmp_path / file for file in files), **options)
-    for side in SIDES:
-        (tmp_path / f"{side}.yaml").write_text(ros_yaml(0))
-    with pytest.raises(CalibrationError, match=r"right\.yaml: .*P of the right one holds no baseline"):
-        slam.load_rig(tmp_path)

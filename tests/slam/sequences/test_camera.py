@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import slam
-from slam.errors import CalibrationError, ConfigurationError, SequenceError
+from slam.errors import SequenceError
 from slam.sequences import camera, is_live
 from tests.recordings import write_opencv
 
@@ -102,31 +102,3 @@ def test_a_camera_that_stays_silent_ends_the_run_with_one_line(rig_here, played)
     assert [next(frames).index, next(frames).index] == [0, 1]
     with pytest.raises(SequenceError, match=r"camera:0: no frames for 0.05 s"):
         next(frames)
-
-
-def test_what_is_asked_for_wrongly_is_one_line(rig_here, played, tmp_path):
-    played({"0": [grey(0, 64)], "1": [grey(0)], "2": [grey(0, 161)], "3": []})
-    with pytest.raises(ConfigurationError, match="name one device"):
-        slam.open_sequence("camera:")
-    for text, words in {
-        "camera:9": "cannot be opened",
-        "camera:0,1": "differ in size: camera:0,1, left is 64x120, .*right is 160x120",
-        "camera:2": "161x120 cannot hold two side by side",
-        "camera:3?wait=0": "gives no images",
-    }.items():
-        played({"0": [grey(0, 64)], "1": [grey(0)], "2": [grey(0, 161)], "3": []})
-        with pytest.raises(SequenceError, match=words):
-            slam.open_sequence(text)
-    with pytest.raises(TypeError, match="no number of frames"):
-        played({"1": [grey(0, 320)]})
-        len(slam.open_sequence("camera:1"))
-    (tmp_path / "calibration.yaml").unlink()
-    words = r"calibration\.yaml: the calibration is missing: add calibration=FILE"
-    with pytest.raises(CalibrationError, match=words):
-        slam.open_sequence("camera:1")
-
-
-def test_a_file_is_no_camera(rig_here, tmp_path):
-    (tmp_path / "both.avi").write_text("x")
-    with pytest.raises(SequenceError, match=r"a file, not a camera; .*layout=sbs"):
-        slam.open_sequence("camera:both.avi")

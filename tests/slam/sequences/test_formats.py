@@ -248,22 +248,3 @@ def test_kitti_360_as_downloaded(tmp_path: Path, build: SimpleNamespace) -> None
     assert seeds(sequence) == PAIRS and sequence.rig.baseline == pytest.approx(0.5)
     assert np.allclose(sequence.ground_truth.stamps, [0.1, 0.2, 0.5])
     assert np.allclose(sequence.ground_truth.positions[:, 0], [1, 2, 5])
-
-
-@pytest.mark.parametrize(
-    ("path", "frames", "size", "baseline", "length"),
-    [
-        ("kitti_odometry/sequences/06", 51, (1226, 370), 0.53715, 59.86),
-        ("kitti_raw/2011_09_26/2011_09_26_drive_0013_sync", 144, (1242, 375), 0.53715, 173),
-        ("euroc/V1_01_keyframes_a", 20, (752, 480), 0.11008, None),
-    ],
-)
-def test_real_recordings(slam_data: Path, path: str, frames: int, size, baseline: float, length: float | None) -> None:
-    sequence = open_sequence(slam_data / path)
-    assert (len(sequence), sequence.rig.width, sequence.rig.height) == (frames, *size)
-    assert sequence.rig.baseline == pytest.approx(baseline, abs=2e-5)
-    assert sequence.warnings == [] and sum(f.right is not None for f in sequence.frames(frames - 3)) == 3
-    truth = sequence.ground_truth
-    if length is not None:
-        assert len(truth) == frames and truth.length == pytest.approx(length, rel=0.01)
-    assert np.abs(truth.stamps[:, None] - sequence.stamps).min(axis=0).max() < 1e-3

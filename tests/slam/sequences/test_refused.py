@@ -30,26 +30,6 @@ def refused(path, error=SlamError, words=None, seconds=1.0):
     return str(caught.value)
 
 
-def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, euroc):
-    here = tmp_path / "here"
-    for name in ("empty", "two/left", "two/right", "two/other/port", "two/other/starboard"):
-        (here / name).mkdir(parents=True)
-    for name in ("sides/0.png", "both.mp4", *(f"cams/cam{k}.png" for k in range(6))):
-        (here / name).parent.mkdir(exist_ok=True)
-        (here / name).write_text("x")
-    for path, words in {
-        "nowhere": "nowhere: there is no such folder",
-        "empty": "the folder is empty",
-        "sides": r"where each image holds both cameras: 'sides\?layout=sbs'",
-        "cams": "no sequence of a known format",  # numbered images of one camera are no pair
-        "both.mp4": r"folder should be; a video .* is .*both\.mp4\?layout=sbs",
-        "two/other": r"by other names: .other\?left=port&right=starboard",
-        euroc / "mav0/cam0/data": rf"give {euroc}(/mav0)? .format euroc",
-        kitti.parent.parent: r"no sequence of a known format .*; below it is sequences.03: give that$",
-    }.items():
-        refused(here / path, SequenceError, words)
-
-
 @pytest.mark.parametrize(
     ("query", "error", "words"),
     [

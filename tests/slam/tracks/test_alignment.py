@@ -94,7 +94,7 @@ def test_features_move_to_their_patches_also_without_a_right_image(right):
     aligned = align(features, landmarks)
     np.testing.assert_allclose(aligned.uv_left, features.uv_left + SHIFT)
     np.testing.assert_allclose(aligned.uv_right, features.uv_right + SHIFT)
-    assert landmarks.has_patch.all()
+    assert landmarks.has_patch(np.arange(4)).all()
 
 
 @pytest.mark.parametrize("nearer,size", [(0.0, 0.0), (2.5, 15.0)])
@@ -104,7 +104,7 @@ def test_a_patch_that_is_not_found_or_of_another_scale_is_taken_anew(nearer, siz
     landmarks = rows(IDS, then, size)
     aligned = align(features, landmarks)
     np.testing.assert_array_equal(aligned.uv_left, features.uv_left)
-    assert not landmarks.has_patch.any()
+    assert not landmarks.has_patch(np.arange(4)).any()
     alignment.take_patches(Shifting(), aligned, SEEN, landmarks, np.eye(4))
     assert [(p.size, p.T_world_left.tolist()) for p in landmarks.patches] == 4 * [(15.0, np.eye(4).tolist())]
 
@@ -115,7 +115,7 @@ def test_a_patch_that_is_seen_larger_is_taken_anew_where_it_is_found_before_it_i
     landmarks = rows(IDS, then)
     aligned = align(features, landmarks)
     np.testing.assert_allclose(aligned.uv_left, features.uv_left + SHIFT)
-    assert not landmarks.has_patch.any()
+    assert not landmarks.has_patch(np.arange(4)).any()
 
 
 def test_without_a_pose_or_images_nothing_moves_and_what_was_not_seen_for_long_is_given_up():
@@ -125,9 +125,9 @@ def test_without_a_pose_or_images_nothing_moves_and_what_was_not_seen_for_long_i
         align(replace(features, images=None), landmarks),
     ):
         np.testing.assert_array_equal(aligned.uv_left, features.uv_left)
-        assert landmarks.has_patch.all()
+        assert landmarks.has_patch(np.arange(4)).all()
     landmarks.unseen[:] = [0, 11, 0, 10]
     aligned = align(features, landmarks)
-    assert landmarks.has_patch.tolist() == [True, False, True, True]
+    assert landmarks.has_patch(np.arange(4)).tolist() == [True, False, True, True]
     moved = np.abs(aligned.uv_left - features.uv_left).max(axis=1) > 0
     assert moved[SEEN.rows].tolist() == [True, False, True, True]

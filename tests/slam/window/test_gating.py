@@ -9,21 +9,6 @@ from slam.window.stereo import RectifiedStereo
 from tests.slam.scene import RIG
 
 
-def covariances(count: int, rng: np.random.Generator) -> np.ndarray:
-    A = rng.standard_normal((count, 3, 3))
-    return A @ np.swapaxes(A, 1, 2) + 0.1 * np.eye(3)
-
-
-def test_distances_are_mahalanobis_with_and_without_the_right_pixel():
-    rng = np.random.default_rng(0)
-    S, nu = covariances(50, rng), rng.standard_normal((50, 3))
-    nu[::3, 2] = np.nan
-    for distance, residual, covariance in zip(squared_distances(nu, S), nu, S):
-        kept = np.isfinite(residual)
-        r = residual[kept]
-        assert distance == pytest.approx(r @ np.linalg.solve(covariance[np.ix_(kept, kept)], r), rel=1e-9)
-
-
 @pytest.mark.parametrize(
     "residual, covariance",
     [
@@ -38,13 +23,6 @@ def test_distances_are_mahalanobis_with_and_without_the_right_pixel():
 def test_what_cannot_be_judged_does_not_pass(residual, covariance):
     residual, covariance = np.array([residual], float), covariance[None]
     assert np.isinf(squared_distances(residual, covariance)).all()
-
-
-def test_whitened_residuals_have_unit_covariance():
-    S, stereo = covariances(50, np.random.default_rng(2)), RectifiedStereo.of(RIG)
-    problem = PoseProblem(stereo, np.ones((50, 3)), np.ones((50, 3)), S, np.eye(4), np.eye(6), 0.99)
-    W = problem.whiteners
-    np.testing.assert_allclose(W @ S @ np.swapaxes(W, 1, 2), np.broadcast_to(np.eye(3), S.shape), atol=1e-9)
 
 
 def test_a_landmark_of_which_too_little_is_known_does_not_take_part_and_fails_nothing():

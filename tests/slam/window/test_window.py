@@ -227,27 +227,6 @@ def test_gradient_is_the_costs_derivative():
     np.testing.assert_allclose(numeric, e.b, rtol=1e-3, atol=1e-3 * np.abs(e.b).max())
 
 
-def test_a_solution_with_each_kind_of_knowledge_is_a_minimum():
-    found, rng = solve(with_everything()), np.random.default_rng(1)
-    e = linearised(found.window)
-    for _ in range(20):
-        x = 1e-3 * rng.standard_normal(found.window.layout.unknowns)
-        assert cost(after(e, x)) > found.cost - 1e-6
-
-
-def test_one_pose_from_known_points():
-    """PnP."""
-    w, (path, points) = window(missing=10**6), truth()
-    rows = w.rows.select(w.rows.pose == 3)
-    rows = replace(rows, pose=np.zeros(len(rows), np.intp))
-    known = np.ones(POINTS, bool)
-    alone = Window(STEREO, path[3:4] @ se3.exp(np.full(6, 0.05)), points, rows, known=known)
-    found = solve(alone)
-    off = se3.log(se3.inverse(found.window.poses[0]) @ path[3])
-    assert off @ np.linalg.solve(found.pose_covariance, off) < 30
-    np.testing.assert_array_equal(found.window.points, points)
-
-
 def test_a_fixed_pose_stays():
     w = window(prior=RelativePrior.none(), free=np.arange(POSES) > 0)
     found = solve(w)

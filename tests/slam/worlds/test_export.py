@@ -3,7 +3,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.errors import SequenceError
 from slam.sequences import open_sequence
 from slam.worlds import open_world
 from slam.worlds.export import write_euroc
@@ -37,13 +36,3 @@ def test_an_exported_world_is_read_back_as_it_was(written):
         assert frame.stamp == pytest.approx(original.stamp, abs=1e-9)
         assert np.array_equal(frame.left, original.left)
         assert np.array_equal(frame.right, original.right) or frame.right is original.right is None
-
-
-def test_a_folder_is_not_overwritten_and_recordings_are_refused(written, tmp_path):
-    sequence, folder = written
-    for what, where, frames, words in (
-        (sequence, folder, (), "exists already"),
-        (open_sequence(folder), tmp_path / "again", (), "only synthetic worlds can be rendered"),
-    ):
-        with pytest.raises(SequenceError, match=words):
-            write_euroc(what, where, *frames)

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
@@ -40,19 +39,6 @@ def test_a_round_later_the_same_landmarks_are_seen(loop):
         assert np.array_equal(first.ids[a], later.ids[b])
         assert np.allclose(first.features.uv_left[a], later.features.uv_left[b], atol=1e-4)
         assert np.allclose(first.features.descriptors[a], later.features.descriptors[b], atol=1e-4)
-
-
-def test_the_town_is_driven_again_in_both_directions():
-    sequence = open_world("town")
-    truth = sequence.ground_truth
-    assert len(sequence) >= 1000
-    way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1))])
-    rows, again = cKDTree(truth.positions).query_pairs(5.0, output_type="ndarray").T
-    far = way[again] - way[rows] > 400
-    cosine = (truth.poses[rows[far], :3, 2] * truth.poses[again[far], :3, 2]).sum(axis=1)
-    assert len(np.unique(again[far][cosine > 0.95])) > 150
-    assert len(np.unique(again[far][cosine < -0.95])) > 100
-    assert np.ptp(truth.positions[:, 2]) < 0.2
 
 
 def test_a_wrong_calibration_is_told_and_the_true_one_records():
