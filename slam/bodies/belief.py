@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slam.bodies.config import CLEAR
 from slam.data import BoolArray, IdArray, RecentPoses
 from slam.geometry.arrays import Table
 from slam.geometry.se3 import Array, transform
@@ -24,7 +25,6 @@ from slam.window.stereo import RectifiedStereo
 
 EVEN = 0.5  #: fixed: a body rather exists than not above this probability, which it has before its first evidence
 _LEAST = 2.0  # ratio of the likelihoods of a measured body, at least: a body at rest shows no motion, but is there
-_LARGEST = 20.0  # χ² that counts of the typical member: many members share one error of the camera's pose
 _CERTAIN = 1.0 - 1e-9  # a probability of 1 could never fall again
 
 
@@ -53,8 +53,11 @@ def first_frame(T_world_left: Array, h: Array) -> tuple[Array, BoolArray]:
 
 
 def when_measured(probability: float, gain: float) -> float:
-    """The probability after a frame that measured the body, which explains a member better than the world by `gain`."""
-    ratio = max(_LEAST, math.exp(0.5 * min(gain, _LARGEST)))
+    """The probability after a frame that measured the body, which explains a member better than the world by `gain`.
+
+    No gain counts for more than is clear: many members share one error of the camera's pose.
+    """
+    ratio = max(_LEAST, math.exp(0.5 * min(gain, CLEAR)))
     return min(_CERTAIN, probability * ratio / (1.0 - probability + probability * ratio))
 
 

@@ -14,7 +14,7 @@ from slam.bodies.belief import EVEN, BodyBelief, when_measured, when_missed
 from slam.bodies.config import CLEAR, MIN_FRAMES
 from slam.bodies.track_kernels import windows_in_body
 from slam.data import BoolArray
-from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, so3_exp, transform
+from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, transform
 from slam.models import ObjectModels
 from slam.object_data import MovingObject
 from slam.tracks.table import Tracks
@@ -245,9 +245,3 @@ def _report(body: Body, belief: BodyBelief, tracks: Tracks) -> MovingObject:
         body.id, np.sort(rows), estimate, motion, T @ inverse(belief.T_begun), extent, body.moving, belief.since,
         body.measured_at, body.existence,
     )  # fmt: skip
-
-
-def spread_of_place(body: Body, y: Array) -> Array:
-    """Covariance (3, 3), in body axes, of where the body's point y (3,) is, given that of its pose."""
-    J = -points_by_pose(y[None])[0]
-    return np.asarray(J @ body.covariance @ J.T)

@@ -15,11 +15,9 @@ estimated pose follows the body, and the still world seems to move.
 The test is made of all free tracks in the world, and of the tracks on a body in that body's axes, where what moves
 otherwise is a part of it: a lid on its hinge, for instance.
 
-A near body that starts to move would carry the camera along. Points of a far wall hardly tell a step sideways from a
-turn, and three points before it decide. So before each update the landmarks found in a frame are compared with where
-their tracks saw them: those that lie together, and whose motion is not that of the rest, are two explanations of one
-frame, by the camera's motion and by theirs. The camera keeps with the rest, which is wider spread, and the covariance
-of its pose grows by what the withheld measurements would have told.
+A near body that starts to move would carry the camera along. So before each update the landmarks found in a frame are
+compared with where their tracks saw them. The camera keeps with the rest, which is wider spread, and the covariance of
+its pose grows by what the withheld measurements would have told.
 """
 
 from __future__ import annotations

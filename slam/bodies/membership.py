@@ -13,7 +13,7 @@ from functools import cache
 
 import numpy as np
 
-from slam.bodies.bodies import Body, in_body_axes, spread_of_place, with_extent
+from slam.bodies.bodies import Body, in_body_axes, with_extent
 from slam.bodies.config import CLEAR, EXPLAINED, MIN_FRAMES, ROUNDS, RUN, WINDOW
 from slam.bodies.fits import fit_positions, times_vectors
 from slam.bodies.frame import Frame
@@ -25,10 +25,9 @@ from slam.tracks.table import Tracks
 
 MARGIN = 0.25  # how far from a body's extent its further features may lie, as a share of the extent's diagonal
 _MOST_POINTS = 80  # cost: members of a body
-_TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]
+_OFF = 0.2  # how far a pose may be from a constant velocity, before anything is known [rad] and [m]
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join
 _LOOSE = 4.0  # times the 99 % limit that the χ² of a member may be whose motion is explained for the most part
-_MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
 _DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
 
@@ -66,7 +65,7 @@ def _with_poses_fitted(body: Body, tracks: Tracks, rows: IndexArray) -> Body:
         y = weighted_means(points, A)
         J = -points_by_pose(y)
         JA = np.swapaxes(J, 1, 2)[:, None] @ A
-        normal = (JA @ J[:, None]).sum(axis=0) + np.diag([_TURN**-2] * 3 + [_SHIFT**-2] * 3)
+        normal = (JA @ J[:, None]).sum(axis=0) + _OFF**-2 * np.eye(6)
         right = times_vectors(JA, points - y[:, None]).sum(axis=0)
         body = replace(body, history=body.history @ exp(np.linalg.solve(normal, right[..., None])[..., 0]))
     return body
@@ -105,7 +104,9 @@ def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> d
     """
     said: dict[int, tuple[Array, int]] = {}
     bodies = {id: body for id, body in every.items() if body.measured}
-    kept = {body.id: _expel(_improve(body, tracks, frame.slot), tracks) for body in bodies.values()}
+    for body in bodies.values():
+        _improve(body, tracks, frame.slot)
+    kept = {body.id: _expel(body, tracks) for body in bodies.values()}
     free = np.flatnonzero((tracks.body < 0) & tracks.found)
     free = free[tracks.count(free) >= 2]
     best, whose = np.full(len(free), -np.inf), np.full(len(free), -1)
@@ -145,7 +146,7 @@ def _expel(body: Body, tracks: Tracks) -> Array:
     """
     mine = np.flatnonzero(tracks.body == body.id)
     (gain, fits, count), seen = membership_test(body, tracks, mine), tracks.found[mine]
-    most_fit = fits[seen].sum() > _MOST * seen.sum()
+    most_fit = 2 * fits[seen].sum() > seen.sum()  # else it is the body's pose that is wrong
     unfit = ~fits & (count >= MIN_FRAMES) & most_fit
     stays = tracks.still[mine] & (body.moving | ~tracks.sure[mine])
     wrong = stays | (tracks.misfit[mine] >= RUN) | (seen & ((gain < -CLEAR) | unfit))
@@ -190,12 +191,6 @@ def tracks_on(body: Body, tracks: Tracks) -> IndexArray:
     return np.concatenate([np.flatnonzero(tracks.found & (tracks.body == body.id)), near])
 
 
-def _explained(body: Body, tracks: Tracks, rows: IndexArray) -> float:
-    """Which share of the χ² of tracks that stand still the motion of a body leaves."""
-    points, A, known = in_body_axes(body, tracks, rows)
-    return float(squares(points, A).sum()) / max(float(_still(tracks, rows, known).sum()), LEAST)
-
-
 def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body | None:
     """The body out of view that a new one is, by position and velocity, perhaps seen from another side; else None.
 
@@ -208,8 +203,8 @@ def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body 
             continue
         gap = new.middle - body.middle
         reach = 0.5 * (body.across + new.across) + max_speed * (new.seen_at - body.seen_at)
-        R, spread = body.T[:3, :3], spread_of_place(body, 0.5 * (body.lower + body.upper))
-        place = R @ spread @ R.T + (body.across**2 + new.across**2) / 12.0 * np.eye(3)
+        J = -body.T[:3, :3] @ points_by_pose(0.5 * (body.lower + body.upper)[None])[0]
+        place = J @ body.covariance @ J.T + (body.across**2 + new.across**2) / 12.0 * np.eye(3)
         change = new.velocity[3:] - body.velocity[3:]
         velocity = (new.velocity_covariance + body.velocity_covariance)[3:, 3:]
         off = float(gap @ np.linalg.solve(place, gap) + change @ np.linalg.solve(velocity, change))
@@ -248,8 +243,8 @@ def _distances(body: Body, tracks: Tracks, rows: IndexArray, margin: float) -> A
     return np.asarray((away * times_vectors(P, away)).sum(axis=1))
 
 
-def _improve(body: Body, tracks: Tracks, slot: int) -> Body:
-    """Take this frame's measurements into the members' points, in place; returns the body."""
+def _improve(body: Body, tracks: Tracks, slot: int) -> None:
+    """Take this frame's measurements into the members' points, in place."""
     t, R = tracks, body.T[:3, :3]
     mine = np.flatnonzero((t.body == body.id) & (t.misfit == 0) & (t.dof[:, slot] > 0))
     gap = (t.p[mine, slot] + t.anchor[mine] - body.T[:3, 3]) @ R - t.local[mine]
@@ -257,7 +252,6 @@ def _improve(body: Body, tracks: Tracks, slot: int) -> Body:
     total = t.local_information[mine] + turned
     t.local_information[mine] = total
     t.local[mine] += times_vectors(inverses(total, RIDGE, 0.0), times_vectors(turned, gap))
-    return body
 
 
 def _still(tracks: Tracks, rows: IndexArray, known: BoolArray) -> Array:
@@ -298,7 +292,9 @@ def _apart(body: Body, mine: IndexArray, other: Body, theirs: IndexArray, tracks
     whole, few, rows = (other, body, mine) if larger else (body, other, theirs)
     near = _distances(whole, tracks, rows, 2.0 * MARGIN * (1.0 + few.across / whole.across)) < _NEAR
     beside = 2 * near.sum() > len(rows)
-    explained = beside and _explained(whole, tracks, rows) < 2 * EXPLAINED
+    points, A, known = in_body_axes(whole, tracks, rows)
+    left = squares(points, A).sum() / max(float(_still(tracks, rows, known).sum()), LEAST)
+    explained = beside and left < 2 * EXPLAINED  # as a share of the χ² of "still"
     if explained and larger and not part and body.seen <= WINDOW:
         return 0.0
     if not (explained or part):

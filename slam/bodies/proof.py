@@ -8,16 +8,13 @@ frames agree, less that of the rest of the scene, is known to within
 - the error of the rig, which is no smaller than the noise of a pixel, but lasts: what is seen with a wrong disparity
   seems to move as the camera does. Members share these two errors, which do not fall with their number.
 
-Members also share errors of which nothing is known: that of a junction of two edges at different depths, for instance,
-which slides along both as the camera moves, with all features around it. Therefore the body's places in the frames of
-the window, or those of its ends, must lie along a way better than they scatter about it (an F test): such a junction
-jumps, and a body goes on. Nor does it turn: how surely the members turn, as a whole, counts as much as the way does.
-What the way has in common with that of the camera says nothing: where an edge crosses the picture of one farther off,
-or a match is wrong by a constant disparity, the place goes a share of the camera's way.
+Members also share errors of which nothing is known: a junction of two edges at different depths slides along both as
+the camera moves. Therefore the body's places in the frames of the window, or those of its ends, must lie along a way
+better than they scatter about it (an F test): a junction jumps, and it does not turn as a whole. What the way has in
+common with that of the camera says nothing: with a wrong disparity the place goes a share of the camera's way.
 
-Along a repeated pattern, a rail before pipes for instance, matches in the right image can be wrong for all members
-alike, by a disparity that changes with the view. Nothing in their way tells. But such features find no match in the
-right image in half of their frames, those of bodies in one of fifteen.
+Along a repeated pattern matches in the right image can be wrong for all members alike, by a disparity that changes with
+the view. Their way does not tell. But such features find no match in the right image in half of their frames.
 """
 
 from __future__ import annotations

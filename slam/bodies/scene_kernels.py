@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.bodies.config import CLEAR
 from slam.chi_square import chi_square_limit
 from slam.kernels.linear import factorise, solve_factorised, square
 from slam.kernels.se3 import point_by_motion
@@ -19,8 +20,7 @@ _SOFT, _SHARP = 3, 2  # numerics: rounds of reweighting: Huber's first, which ha
 LARGEST = 0.4  #: share of all tracks that a body may have: the still world has most
 FITS = 14.2  #: derived: χ²(3) at 99.7 %, of a track and a common motion
 _EXPLAINED = 0.25  # share of χ² that the common motion may leave: an uneven motion is seen by tracks unevenly
-_BETTER = 4.0  # by how much χ² a member must fit its group's motion better than the rest's, and
-_BETTER_AROUND = 6.0  # where it lies outside the window
+_BETTER = 4.0  # by how much χ² a member must fit its group's motion better than the rest's; outside the window CLEAR
 _AROUND = 1.0  # how far beyond its window a group's tracks are looked for, in widths of the window
 _CELLS = 2**12  # numerics: more than there are windows along an axis
 _MOST = 20  # cost: windows looked into for the next group
@@ -208,11 +208,10 @@ def _gain(triangle, gradient, factor, work):
 def _window_tests(starts, tracks, L, eta, dWd, alone, scale, rest, asked, support, largest, clear):
     """By how much the χ²(6) of every window exceeds what is asked, into `clear` (M,); −∞ where it does not.
 
-    The test is whether the motion of the tracks inside is that of the rest; `asked` (N + 1,) is by their number. It is
-    what the tracks inside and those outside gain by motions of their own, beside the motion ξ that both share: ``gᵀ
-    (Λ_w⁻¹ + Λ_r⁻¹) g`` with the gradient ``g = Λ_w ξ − η_w``. The first gain is at most their χ² against ξ. With a
-    share of at most ``ρ = tr(Λ⁻¹ Λ_w)`` of the information along any motion, the sum is at most the first over 1 − ρ;
-    most windows need no more than these sums.
+    The test is whether the tracks inside move as the rest; `asked` (N + 1,) is by their number. It is what both gain by
+    motions of their own over the one that they share, ξ: ``gᵀ (Λ_w⁻¹ + Λ_r⁻¹) g`` with ``g = Λ_w ξ − η_w``. The first
+    gain is at most the χ² of those inside against ξ, and both together at most the first over 1 − ρ: of the information
+    on any motion those inside have no more than ``ρ = tr(Λ⁻¹ Λ_w)``. Most windows need no more than these sums.
     """
     n = len(alone)
     total, told, weight, off, hold = np.zeros(21), np.zeros(6), np.zeros(n), np.empty(n), np.empty(n)
@@ -322,7 +321,7 @@ def groups_apart(L, eta, dWd, place, starts, tracks, centres, widths, asked, sup
                 found = 0
                 for m in range(n):
                     rows[m] = rest[m] and fits[m] < max(FITS, _EXPLAINED * apart[m])
-                    rows[m] = rows[m] and apart[m] - fits[m] > (_BETTER if seeds[m] else _BETTER_AROUND)
+                    rows[m] = rows[m] and apart[m] - fits[m] > (_BETTER if seeds[m] else CLEAR)
                     for axis in range(3):
                         off = abs(place[m, axis] - centres[window, axis])
                         rows[m] = rows[m] and off < (0.5 + _AROUND) * widths[window, axis]

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from slam.bodies import track_kernels
+from slam.bodies import scene_kernels, track_kernels
+from tests.slam.bodies.test_scene import scene
 
 RNG = np.random.default_rng(5)
 TRACKS, SLOTS = 7, 6
@@ -40,3 +42,22 @@ def test_a_displacement_is_less_certain_by_the_slide_of_a_feature_seen_from_else
         _, W, _ = track_kernels.displaced(A, p, dof, np.array([0]), ages, 3, ray, centres, slide)
         P[slide] = np.linalg.inv(W[0])
     np.testing.assert_allclose(P[1e-4] - P[0.0], 1e-4 * 0.1 * 2.0**2 * np.diag([1.0, 1.0, 0.0]), atol=1e-12)
+
+
+@pytest.mark.parametrize("known", [1.0, 0.1])
+def test_the_test_of_a_window_is_that_of_two_motions(known):
+    """Also where a few near points know more of some motions than all others."""
+    moved, view = scene(count=60, near=6, shift=(0.004, 0.0, 0.0))
+    moved.W[6:] *= known
+    L, eta, dWd = scene_kernels.normal_equations(moved.points, moved.d, 0.5 * moved.W, moved.lag)
+    windows = [np.arange(3, 9), np.arange(6), np.arange(5, 60, 9)]
+    starts, tracks = np.cumsum([0, *map(len, windows)]), np.concatenate(windows)
+    place, asked = (np.zeros((3, 3)), np.ones((3, 3))), np.full(61, 5.0)
+    values = scene_kernels.groups_apart(L, eta, dWd, view, starts, tracks, *place, asked, 4)[1]
+    full = np.zeros((60, 6, 6))
+    full[:, *np.tril_indices(6)] = L
+    full += np.swapaxes(np.tril(full, -1), 1, 2)
+    rest = np.arange(6, 60)
+    H, G = (full[k].sum(axis=0) + np.diag(scene_kernels.PRIOR) for k in (windows[1], rest))
+    gap = np.linalg.solve(H, eta[windows[1]].sum(axis=0)) - np.linalg.solve(G, eta[rest].sum(axis=0))
+    assert values == pytest.approx([gap @ np.linalg.solve(np.linalg.inv(H) + np.linalg.inv(G), gap)], rel=1e-6)

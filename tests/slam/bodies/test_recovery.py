@@ -88,10 +88,12 @@ def test_few_points_move_a_body_but_do_not_turn_it_wildly(seen):
     assert np.degrees(np.arccos((np.trace(T[:3, :3]) - 1) / 2)) < 3.0
 
 
-def test_points_that_do_not_agree_with_the_motion_say_nothing():
+def test_points_that_do_not_agree_or_are_too_few_say_nothing():
+    """Two points, where the body may be anywhere."""
     body, tracks, features, _ = scene(3, np.zeros(6), np.random.default_rng(5))
-    features.uv_left[0] += 40.0
-    features.uv_left[1] -= 40.0
+    features.uv_left[:2] += [[40.0], [-40.0]]
+    assert place(body, tracks, features) is None
+    body, tracks, features, _ = scene(2, np.zeros(6), np.random.default_rng(6), deviation=2.0)
     assert place(body, tracks, features) is None
 
 
@@ -103,8 +105,3 @@ def test_a_point_that_disagrees_is_followed_on_and_counted():
     assert place(body, tracks, features) is not None
     assert tracks.row[:4].tolist() == [0, 1, 2, 3]
     assert tracks.misfit[:4].tolist() == [0, 0, 0, 1]
-
-
-def test_two_points_do_not_place_a_body_that_may_be_anywhere():
-    body, tracks, features, _ = scene(2, np.zeros(6), np.random.default_rng(6), deviation=2.0)
-    assert place(body, tracks, features) is None
