@@ -44,7 +44,7 @@ class ObjectsConfig:
     def __post_init__(self) -> None:
         require_not_negative(self, {}, "objects")
         if self.mode not in MODES:
-            raise ConfigurationError(f"objects: mode must be one of {MODES}, got {self.mode!r}")
+            raise ConfigurationError(f"objects: mode must be one of {', '.join(MODES)}, got {self.mode!r}")
         if self.mode == "procedure1" and not self.database:
             raise ConfigurationError("objects: mode procedure1 needs a database of the object's features")
         for name in ("max_speed", "suspect"):

@@ -52,7 +52,7 @@ def _causes(model: RigModel, covariance: Array, evidence: Evidence, whose: str) 
         return float(pull @ A @ values), values.tolist()
 
     gain, (focal,) = freed(FOCALS)
-    much = f"about {abs(100 * focal):.0f} % {'shorter' if focal > 0 else 'longer'} than the {whose}'s"
+    much = f"at least {abs(100 * focal):.0f} % {'shorter' if focal > 0 else 'longer'} than the {whose}'s"
     yield gain, f"the images fit a focal length {much}: is it of this camera, and for images of this size?"
     gain, (k1, _) = freed(*_DISTORTION)
     cause = "are its coefficients of this camera, in this order and of this model?"

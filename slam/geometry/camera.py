@@ -86,6 +86,10 @@ class PinholeCamera:
         matrix, coefficients = floats("camera matrix", K), floats("distortion", D if D is not None else ()).ravel()
         if matrix.shape != (3, 3):
             raise CalibrationError(f"the camera matrix must be (3, 3), got {matrix.shape}")
+        if not is_camera_matrix(matrix):
+            raise CalibrationError(f"no camera matrix [fx 0 cx; 0 fy cy; 0 0 1]: {matrix.tolist()}")
+        if 0 < len(coefficients) < 4:
+            raise CalibrationError(f"OpenCV's distortion has at least 4 coefficients, got {len(coefficients)}")
         values = coefficients.tolist()
         while len(values) > 8 and values[-1] == 0:
             values.pop()
@@ -194,6 +198,15 @@ class PinholeCamera:
         from slam.geometry import kernels
 
         return np.asarray(kernels.undistort(np.ascontiguousarray(target), self._coefficients, self._radius_limit))
+
+
+#: guard: largest skew as a share of the focal length: a thousandth moves the image's border by half a pixel.
+_SKEW = 1e-3
+
+
+def is_camera_matrix(K: Array) -> bool:
+    """Whether K (3, 3) is ``[fx 0 cx; 0 fy cy; 0 0 1]``."""
+    return bool(abs(K[0, 1]) <= _SKEW * abs(K[0, 0]) and K[1, 0] == 0 and (K[2] == (0, 0, 1)).all())
 
 
 #: guard: plausible baselines [m]; others are more often a length in another unit.

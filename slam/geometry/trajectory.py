@@ -181,9 +181,11 @@ def _read_table(path: str | Path, delimiter: str | None, columns: int) -> Array:
             text = read_text(path, error=TrajectoryError)
             rows = np.loadtxt(text.splitlines(), delimiter=delimiter, ndmin=2, comments="#")
     except ValueError as error:
+        if delimiter is None and "," in text.splitlines()[-1]:
+            raise TrajectoryError(f"{path}: its columns are apart by commas, and have to be by spaces") from error
         raise TrajectoryError(f"{path}: cannot be read as a trajectory: {error}") from error
     if rows.shape[1] < columns or not len(rows):
-        raise TrajectoryError(f"{path}: a trajectory has {columns} columns, found {rows.shape}")
+        raise TrajectoryError(f"{path}: such a trajectory has {columns} columns, found {rows.shape[1]}")
     if not np.isfinite(rows[:, :columns]).all():
         raise TrajectoryError(f"{path}: a value is not finite")
     return rows

@@ -70,13 +70,15 @@ def calibrate(
     kept = joint_calibration(model, factory_prior(model), known)
     apart = agreement(model, known)
     pairs, unsolved = (sum(one[key] for one in recordings) for key in ("pairs", "unsolved_pairs"))
-    warning, judgement, worth = "" if pairs else _NO_PAIRS, "", False
+    warning, judgement, worth = "", "", False
     doubt = next((f"{one['sequence']}: {one['doubt']}" for one in recordings if one["doubt"]), "")
     if unsolved > pairs:
         warning = (
             f"{unsolved} of {pairs + unsolved} pairs of views agree on no motion: is the calibration of these cameras, "
             "and of images of this size?"
         )
+    elif not pairs:  # rows alone say little
+        warning = _NO_PAIRS
     elif doubt:  # what is held back by what good calibrations are off by is no correction
         warning = doubt
     else:

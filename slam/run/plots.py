@@ -348,7 +348,11 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
     noisy = any(run.truth is not None and run.truth_noise != TruthNoise() for run in runs)
     title = "Online error since the start (solid), claimed σ (dashed)"
     title += "\nσ with that of the truth; grey: the truth is doubtful" if noisy else ""
-    title += "\nthe true path looks wrong" if any(run.summary.get("truth_doubt") for run in runs) else ""
+    title += (
+        "\nthe true path and the estimated one do not fit"
+        if any(run.summary.get("truth_doubt") for run in runs)
+        else ""
+    )
     axes[0].set_title(title if known else "Claimed σ of the online pose; no true path is known")
     axes[-1].set_xlabel("time [s]")
     if len(runs) > 1:

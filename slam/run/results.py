@@ -14,6 +14,7 @@ import numpy as np
 
 from slam.evaluation.consistency import BEFORE, EXACT, PIXELS_ALONE
 from slam.evaluation.metrics import chi_square_band
+from slam.naming import count
 
 _SCALES = {"mm": 1e3, "%": 100.0}  # units in which people see metres and shares
 
@@ -89,7 +90,7 @@ METRICS = (
            "compared main run brief"),
     Metric("rpe_1s_m", "online drift in 1 s (RPE)", "mm", "accuracy/online/RPE RMSE over 1 s [m]", "lower",
            "compared run"),
-    Metric("rpe_1s_deg", "online drift in 1 s, rotation (RPE)", "deg",
+    Metric("rpe_1s_deg", "online drift of rotation in 1 s (RPE)", "deg",
            "accuracy/online/RPE rotation RMSE over 1 s [deg]", "lower"),
     Metric("segment_percent", "online drift by distance (RPE)", "%", "accuracy/online/segment error [%]", "lower",
            "compared run"),
@@ -234,7 +235,7 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     if exact:
         others.append("they count errors of the calibration, and this world's cameras have none")
     if found.get("exact_truth"):
-        others.append("the true path is taken as exact")
+        others.append("the true path is taken as exact, so its own errors count as the estimate's")
     if found.get("pixels_alone"):
         others.append("they count pixel noise alone, and no errors of the calibration")
     return "; ".join([f"covariances {word}: {times} {band}", *others])
@@ -244,7 +245,7 @@ def verdict_of_run(summary: Mapping[str, Any]) -> str:
     """`verdict` on a run by its summary, with what it leaves out; empty where no true path is known."""
     text, honest = verdict(figures(summary)), summary.get("consistency") or {}
     if not text and summary.get("truth_doubt"):
-        return "covariances are not judged: the true path looks wrong, see the run's warnings"
+        return "covariances are not judged: the true path and the estimated one do not fit, see the run's warnings"
     doubtful = {over: share for over in _NEES.values() if (share := honest.get(f"doubtful truth {over}"))}
     if not text and not honest.get("dof"):
         return ""
@@ -257,8 +258,8 @@ def verdict_of_run(summary: Mapping[str, Any]) -> str:
         why = (
             "they are singular" if honest.get("singular covariances")
             else "the true path is doubtful, as where it was interpolated over a gap" if doubtful
-            else f"the true path begins {honest[BEFORE]:.0f} frames after the first, and what they say of the motion "
-            "since then is less than what they say of its begin" if honest.get(BEFORE)
+            else f"the true path begins {count(int(honest[BEFORE]), 'frame')} after the first, so that only the motion "
+            "since then is known, for which the covariances at its ends leave none" if honest.get(BEFORE)
             else "they leave none for the motion between two poses, as where a back end claims the same one for every "
             "frame"
         )  # fmt: skip

@@ -136,9 +136,10 @@ def results_of(
         )
     online, steps = path.select(measured), np.diff(path.positions, axis=0)
     truth, noise = sequence.ground_truth, getattr(sequence, "truth_noise", TruthNoise())
-    doubt, wrong = "", False
-    if truth is not None and noise == TruthNoise() and sequence.format != "synthetic":  # it is taken as exact
-        doubt, wrong = truth_doubt(online, truth)
+    doubt = ""
+    exact = noise == TruthNoise() and sequence.format != "synthetic"  # the truth is taken as such
+    if truth is not None and exact and not getattr(system, "doubt", ""):  # a path that is doubted tells nothing of it
+        doubt = truth_doubt(online, truth)
     if doubt:
         logger.warning("%s", doubt)
     speeds = np.linalg.norm(steps, axis=1) / np.diff(path.stamps)
@@ -156,7 +157,7 @@ def results_of(
         },
         "consistency": {
             "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
-            **({} if wrong else consistency(online, np.array(record.covariances)[measured], sequence, common)),
+            **({} if doubt else consistency(online, np.array(record.covariances)[measured], sequence, common)),
         },
     }
     if none:

@@ -44,21 +44,21 @@ class _Fit(NamedTuple):
     motions: int
 
 
-def truth_doubt(own: Trajectory, truth: Trajectory) -> tuple[str, bool]:
-    """What is wrong with a true path, in a line, and whether it is too wrong to judge covariances by.
+def truth_doubt(own: Trajectory, truth: Trajectory) -> str:
+    """Why covariances cannot be judged by a true path, in a line: it looks wrong, or is of another scale.
 
     Args:
         own: the estimated path, of measured poses.
         truth: the true path as it was given, at stamps of its own.
 
     Returns:
-        the line, empty where the paths agree or too little is known; and whether the mistake is the truth's.
+        the line, empty where the paths agree or too little is known.
     """
     if len(own) > _ROWS:
         own = own.select(np.linspace(0, len(own) - 1, _ROWS).astype(int))
     given = _fit(own, truth, 0.0, free="")
     if given is None:
-        return "", False
+        return ""
     w_first = quaternion(truth.poses[:, :3, :3])[:, [1, 2, 3, 0]]
     as_w_first = pose(rotation_from_quaternion(w_first), truth.positions)
     poses = {
@@ -66,56 +66,53 @@ def truth_doubt(own: Trajectory, truth: Trajectory) -> tuple[str, bool]:
         "its quaternions are w x y z, and must be x y z w": as_w_first,
         "its poses are inverse, and must be those of the camera in the world": inverse(truth.poses),
     }
-    readings = {said: Trajectory(truth.stamps, read) for said, read in poses.items()}
-    fitted = {said: _with_shift(own, reading) for said, reading in readings.items()}
-    said = min(fitted, key=lambda one: fitted[one][0].error * (_EXPLAINS if one else 1.0))
-    (best, shift), reading = fitted[said], readings[said]
-    if given.error < _EXPLAINS * best.error or best.error > _MISFIT:
+    tried = []
+    for said, read in poses.items():
+        reading = Trajectory(truth.stamps, read)
+        for at in (0.0, _shift(own, reading)):
+            for free in ("", "scale", "body", "scale body"):
+                mistakes = bool(said) + bool(at) + len(free.split())
+                if (fit := _fit(own, reading, at, free)) is not None:
+                    tried.append((fit.error * _EXPLAINS**mistakes, mistakes, fit, said, at, free))
+    _, mistakes, best, said, shift, free = min(tried, key=lambda one: one[:2])
+    if not mistakes or best.error > _MISFIT:
         return _unexplained(own, truth, given.error)
-
-    def needs(free: str, at: float) -> bool:
-        fit = _fit(own, reading, at, free)
-        return fit is None or fit.error > _EXPLAINS * best.error
-
     causes = [said] if said else []
-    late, body, scaled = (needs(*one) for one in (("scale body", 0.0), ("scale", shift), ("body", shift)))
-    if late:
+    if shift:
         causes.append(f"its times are {abs(shift):.2f} s too {'late' if shift > 0 else 'early'}")
-    if body:
+    if "body" in free:
         causes.append(
             f"it is that of a body turned by {best.turn:.1f}° against the left camera, {best.lever:.2g} m from it: "
             f"multiply its poses by the camera's in that body{'' if best.turn > _MOUNTED else ', or check cx and cy'}"
         )
-    if scaled and not 1 / _FAR < best.scale < _FAR:
+    if not 1 / _FAR < best.scale < _FAR:
         near = (unit for unit, size in _UNITS.items() if abs(np.log(best.scale / size)) < _NEAR)
         causes.append(
             f"it is {best.scale:.3g} times as long as the estimated one: is it in {next(near, 'another unit')}? "
             "(The option unit= does not apply to it.)"
         )
     if causes:
-        return f"the true path looks wrong: {'; and '.join(causes)}", True
-    if scaled:
-        return (
-            f"the estimated path is {1 / best.scale:.3g} times as long as the true one: check the calibration's "
-            "baseline and focal length, or the unit of the true path"
-        ), False
-    return _unexplained(own, truth, given.error)
+        return f"the true path looks wrong: {'; and '.join(causes)}"
+    return (
+        f"the estimated path is {1 / best.scale:.3g} times as long as the true one: check the calibration's "
+        "baseline and focal length, or the unit of the true path"
+    )
 
 
-def _unexplained(own: Trajectory, truth: Trajectory, error: float) -> tuple[str, bool]:
+def _unexplained(own: Trajectory, truth: Trajectory, error: float) -> str:
     """What to say where no mistake explains why motions differ: of rotations alone, where positions agree."""
     pairs = associate(own, truth)
     extent = float(np.sqrt(3 * pairs[1].positions.var(axis=0).mean()))
     if error < _APART or absolute_errors(*pairs).rmse > _ALIKE * extent:
-        return "", False
+        return ""
     return (
         "the true path looks wrong: its positions agree with the estimated path, its rotations do not: are they the "
         "left camera's (x right, y down, z forward), in the world of the positions?"
-    ), True
+    )
 
 
-def _with_shift(own: Trajectory, truth: Trajectory) -> tuple[_Fit, float]:
-    """The best fit of all, and the shift [s] by which the truth's stamps are late."""
+def _shift(own: Trajectory, truth: Trajectory) -> float:
+    """The shift [s] by which the truth's stamps are late, if the best fit of all is right."""
     best, shift = _fit(own, truth, 0.0) or _Fit(np.inf, 1.0, 0.0, 0.0, 0), 0.0
     half = best.motions / 2
     for step, reach in ((_STEP, _LATEST), (_STEP / 10, _STEP)):
@@ -123,7 +120,7 @@ def _with_shift(own: Trajectory, truth: Trajectory) -> tuple[_Fit, float]:
             fit = _fit(own, truth, float(at))
             if fit is not None and fit.error < best.error and fit.motions > half:
                 best, shift = fit, float(at)
-    return best, shift
+    return shift
 
 
 def _fit(own: Trajectory, truth: Trajectory, shift: float, free: str = "scale body") -> _Fit | None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.files import expanded
-from slam.geometry.camera import PinholeCamera, baseline_doubt, size_doubt
+from slam.geometry.camera import PinholeCamera, baseline_doubt, is_camera_matrix, size_doubt
 from slam.geometry.rig import NOT_SIDE_BY_SIDE, StereoRig
 from slam.geometry.se3 import Array, inverse, is_rotation, pose, so3_exp
 from slam.sequences.calibration import Entries, array, naming, plain_name, read_entries
@@ -43,9 +43,6 @@ _FOUR = ("fx", "fy", "cx", "cy")
 
 #: guard: shortest focal length as a share of the image's width: a pinhole camera of 170 degrees has 0.044.
 _SHORTEST_FOCAL = 0.04
-
-#: guard: largest skew as a share of the focal length: a thousandth moves the image's border by half a pixel.
-_SKEW = 1e-3
 
 #: guard: cosine of the widest angle between the optical axes of a stereo pair, 60 degrees.
 _ALIKE = 0.5
@@ -316,7 +313,7 @@ def _matrix(entries: Entries, side: int | None) -> Array:
         fx, fy, cx, cy = values
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     K = values.reshape(3, 3)
-    if abs(K[0, 1]) > _SKEW * abs(K[0, 0]) or K[1, 0] != 0 or (K[2] != (0, 0, 1)).any():
+    if not is_camera_matrix(K):
         raise CalibrationError(f"{name} is no camera matrix [fx 0 cx; 0 fy cy; 0 0 1]: {K.tolist()}")
     return K
 

@@ -30,8 +30,8 @@ def test_two_recordings_of_one_rig(made):
     assert all(abs(row["mean"] + 1e-3) < 3 * row["sigma"] for row in turn)
     assert any(abs(row["mean"]) > 1e-4 for row in turn)
     assert tree["agreement"].startswith("The recordings agree")
-    assert tree["judgement"] in " ".join(printed.split())
-    assert tree["judgement"].startswith("The calibration is off by")
+    assert tree["agreement"] in " ".join(printed.split())
+    assert not tree["judgement"] and "no two views" in tree["warnings"][0]  # a few frames say nothing of disparities
 
 
 @pytest.mark.parametrize(

@@ -121,3 +121,18 @@ def test_the_scale_of_rectified_pixels():
     assert not rig.is_rectified
     assert rig.rectified.scale == pytest.approx(rig.rectified.rig.left.fu / 300.0)
     assert StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.1, 320, 240).rectified.scale == 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"K_left": LEFT.K / 500}, "no camera matrix"),
+        ({"K_left": LEFT.K.T}, "no camera matrix"),
+        ({"K_left": LEFT.K + 80 * np.eye(3, k=1)}, "no camera matrix"),
+        ({"D_left": [0.1, 0.01, 0.0]}, "at least 4"),
+        ({"T": [-0.11, 0, 0]}, "either T or baseline"),
+    ],
+)
+def test_impossible_camera_matrices(change, message):
+    with pytest.raises(CalibrationError, match=message):
+        StereoRig.from_pinhole(**{"K_left": LEFT.K, "baseline": 0.11, "size": (640, 480), **change})
