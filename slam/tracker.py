@@ -191,16 +191,16 @@ class Tracker:
         """Update the back end; `Elsewhere` in an unknown place.
 
         The pose was not measured if the back end used less than half of the landmarks that agree with each other; a
-        lost camera must match more landmarks than a tracked one. The pose of a camera that stands holds.
+        lost camera must match more landmarks than a tracked one. Once measured, the pose of a camera that stands holds.
         """
         matches, standing, before, c = step.matches, step.standing, step.tracking, self.config
         observations, pose = matches.observations(step.features), matches.T_world_left
         # A camera that stands measures the same landmarks with the same errors again, which tells nothing new.
-        holds = standing.stands and isinstance(state.backend, RestingBackend)
+        holds = standing.stands and not before.unmeasured and isinstance(state.backend, RestingBackend)
         if holds:
             observations, pose = observations.select(np.zeros(0, np.intp)), None
         report: UpdateReport = checked(state.backend, "update", state.backend.update(observations, pose))
-        if holds and report.status is UpdateStatus.EMPTY:
+        if holds and len(matches.ids) and report.status is UpdateStatus.EMPTY:
             report = replace(report, status=UpdateStatus.OK, reason="", used=matches.ids)
         least = c.association.minimum_consistent if before.lost else MINIMAL_POINTS
         measured = len(report.used) >= least and 2 * len(report.used) >= len(matches.ids)

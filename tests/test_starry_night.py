@@ -28,11 +28,14 @@ def load(folder):
     return StereoRig.rectified_pair(f, u0, v0, b, 640, 480), sigma, raw["t"][0], true, pixels
 
 
-@pytest.mark.parametrize("name", ["ekf", "iekf", "smoother", "window"])
-def test_a_camera_that_often_sees_less_than_three_landmarks_knows_where_it_is(slam_data, name):
+@pytest.mark.parametrize(
+    ("name", "options"), [("ekf", {}), ("iekf", {}), ("smoother", {}), ("smoother", {"poses": "seen"}), ("window", {})]
+)
+def test_a_camera_that_often_sees_less_than_three_landmarks_knows_where_it_is(slam_data, name, options):
     start = 150  # before, hardly anything was in view
     rig, sigma, stamps, true, pixels = load(slam_data)
-    backend, known, found, rejected = backends.create(name, rig, models=EstimatorModels(pixel_sigma=sigma)), [], [], 0
+    backend = backends.create(name, rig, models=EstimatorModels(pixel_sigma=sigma), **options)
+    known, found, rejected = [], [], 0
     for k in range(start, len(stamps)):
         ids = np.flatnonzero(np.isfinite(pixels[k, :, 0]))
         seen = Observations(ids, pixels[k, ids, :2], pixels[k, ids, 2:])

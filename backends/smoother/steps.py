@@ -23,6 +23,8 @@ from slam.window.gating import MIN_CONSENSUS
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.stereo import RectifiedMeasurement, relative_covariance
 
+_DARK = 100  # frames without a measurement after which the problem begins anew: they would be poses of the graph
+_KNOWN = 1e9  # condition of a pose's information by its landmarks from which on they do not determine it
 _SAME = 0.5  # share of a pose's landmarks that another one must measure to say nothing new
 _ALONE: tuple[Array, Array] = np.zeros((12, 12)), np.zeros((6, 12))  # `pair` and `shared` of a first pose
 
@@ -42,6 +44,8 @@ class Steps(RectifiedMeasurement):
 
     def predicted(self, s: SmootherState, stamp: float, rests: bool = False) -> SmootherState:
         """With the newest frame at `stamp` [s], by the motion model."""
+        if s.started and self.config.lag is not None and s.number - s.anchor >= _DARK:
+            s = _without_dark(s).without_old(self.config.past, self.config.lag)
         s = replace(
             s, stamps=np.append(s.stamps, stamp), rests=np.append(s.rests, rests),
             sights=(*s.sights, Sight.none()), measured=False,
@@ -131,7 +135,8 @@ class Steps(RectifiedMeasurement):
             P = _in_world(s, found.T, np.zeros((6, 6)), np.linalg.inv(one.information + G.T @ G))
             P = world_covariance(s.spread[-1]) if marks.world[seen].any() else P
             return self._anew(s, graph, found.T, P, seen, z[used])
-        if self.config.poses == "seen" and self._saw_the_same(s, marks.serial[seen]):
+        known = np.linalg.cond(G.T @ G) < _KNOWN
+        if self.config.poses == "seen" and known and self._saw_the_same(s, marks.serial[seen]):
             return _aside(s, found.T, G.T @ G, by_rig), nis, ""
         linear = math.sqrt(self.stereo.f / self.models.pixel_sigma)
         marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T, linear)
@@ -282,7 +287,7 @@ def _anchored(s: SmootherState) -> SmootherState:
     """
     if s.anchor == s.number:
         return s
-    s = replace(_seeing(s), landmarks=s.landmarks.left_behind(np.zeros(0, np.intp), s.poses[-1], s.own))
+    s = _left_behind(s)
     if unknown_turn(s.own):
         return _begun(s, s.poses[-1], s.spread[-1])
     pair, shared = _before(np.roll(s.pair, 6, (0, 1)), s.poses[-2:])
@@ -290,6 +295,21 @@ def _anchored(s: SmootherState) -> SmootherState:
     A, B = (adjoint(inverse(T) @ one) for T, one in ((s.poses[-1], at), (s.poses[-2], s.poses[-1])))
     shared[:, :6] += A @ (s.shared[:, :6] - s.shared[:, 6:] @ B.T)
     return replace(s, pair=pair, shared=shared, anchor=s.number)
+
+
+def _without_dark(s: SmootherState) -> SmootherState:
+    """With the newest pose, which measured nothing, as the first of a problem; landmarks are known from it."""
+    s = _left_behind(s)
+    s, rows = _begun(s, s.poses[-1], s.spread[-1]), np.flatnonzero(~s.landmarks.world)
+    marks = s.landmarks
+    local, own = pose_only.seen_from(s.poses[-1], marks.position[rows], marks.from_newest[rows])
+    known = {n: Known(x, P, s.number) for n, x, P in zip(marks.serial[rows].tolist(), local, own)}
+    return replace(s, known={**s.known, **known})
+
+
+def _left_behind(s: SmootherState) -> SmootherState:
+    """With the newest pose as one that saw something, and landmarks relative to it though it measured none."""
+    return replace(_seeing(s), landmarks=s.landmarks.left_behind(np.zeros(0, np.intp), s.poses[-1], s.own))
 
 
 def _seeing(s: SmootherState) -> SmootherState:

@@ -132,6 +132,26 @@ def test_frames_that_measured_nothing_are_no_failure(lag, dark):
     assert lag < 4 or np.sqrt(np.trace(last.covariance[3:, 3:])) < 0.04
 
 
+@pytest.mark.parametrize("lag", [4, None])
+def test_a_long_rest_is_no_burden_and_its_map_is_still_known(lag):
+    data, backend, known = list(drive(24, points=250)), SmootherBackend(RIG, MODELS, lag=lag), set()
+    for stamp, _, seen in data[:20]:
+        step(backend, stamp, seen, known)
+    last, before = data[19], backend.estimate(landmarks=False)
+    for k in range(1, 351):
+        backend.predict_at_rest(last[0] + DT * k)
+        backend.update(Observations.empty())
+    assert lag is None or len(backend.state.poses) < 250
+    for k, (_, _, seen) in enumerate(data[20:], 1):
+        report = step(backend, last[0] + DT * (350 + k), seen, known)
+        assert report.status is UpdateStatus.OK and len(report.rejected) < 4
+    off = se3.log(se3.inverse(backend.estimate(landmarks=False).T_world_left) @ data[23][1])
+    after = backend.estimate(landmarks=False)
+    assert off @ np.linalg.solve(after.covariance, off) < 25
+    assert np.sqrt(np.trace(after.covariance[3:, 3:])) < 2 * np.sqrt(np.trace(before.covariance[3:, 3:]))
+    assert len(backend.trajectory()) == 374
+
+
 def test_landmarks_that_were_found_together_do_not_all_begin_anew_together():
     """That would leave but the motion model between two poses, and the newest one 2.8 times as uncertain."""
     data = drive(22, points=150)
