@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from numbers import Real
+from traceback import walk_tb
 from typing import Any
 
 import numpy as np
@@ -73,12 +74,14 @@ def named_failures(place: str, *parts: object) -> Iterator[None]:
 
     If all parts are our own, exceptions pass unchanged. `place` is the present operation, for the message.
     """
-    foreign = [type(part).__name__ for part in parts if type(part).__module__.partition(".")[0] not in _OURS]
+    theirs = [type(part) for part in parts if type(part).__module__.partition(".")[0] not in _OURS]
     try:
         yield
     except AnswerError as error:
         raise SlamError(f"{place}: {error}") from error
-    except Exception as error:  # whatever a third-party class does
-        if not foreign or isinstance(error, SlamError):
-            raise
-        raise PartError(f"{place}: {' or '.join(foreign)} failed: {cause(error)}") from error
+    except (Exception, SystemExit) as error:  # whatever a third-party class does
+        *_, (last, _) = walk_tb(error.__traceback__)
+        by_part = last.f_globals.get("__name__") in [part.__module__ for part in theirs]
+        if not theirs or isinstance(error, SlamError) or (isinstance(error, SystemExit) and not by_part):
+            raise  # a signal's handler may end the program anywhere
+        raise PartError(f"{place}: {' or '.join(t.__name__ for t in theirs)} failed: {cause(error)}") from error

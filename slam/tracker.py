@@ -200,7 +200,7 @@ class Tracker:
         if holds:
             observations, pose = observations.select(np.zeros(0, np.intp)), None
         report: UpdateReport = checked(state.backend, "update", state.backend.update(observations, pose))
-        if holds and len(matches.ids) and report.status is UpdateStatus.EMPTY:
+        if holds and len(matches.ids) and report.status is not UpdateStatus.FAILED:
             report = replace(report, status=UpdateStatus.OK, reason="", used=matches.ids)
         least = c.association.minimum_consistent if before.lost else MINIMAL_POINTS
         measured = len(report.used) >= least and 2 * len(report.used) >= len(matches.ids)

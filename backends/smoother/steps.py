@@ -16,7 +16,7 @@ from backends.smoother.graph import Graph, Solved, SolverError
 from backends.smoother.landmarks import VARIABLE, SmootherLandmarks, inverses
 from backends.smoother.state import Aside, Known, Sight, SmootherState
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
-from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
+from slam.geometry.se3 import Array, adjoint, exp, inverse, log, points_by_pose, transform
 from slam.window import pose_only
 from slam.window.consensus import landmarks_pose
 from slam.window.gating import MIN_CONSENSUS
@@ -24,7 +24,6 @@ from slam.window.recovery import Agreement, agreement, unknown_turn, world_covar
 from slam.window.stereo import RectifiedMeasurement, relative_covariance
 
 _DARK = 100  # frames without a measurement after which the problem begins anew: they would be poses of the graph
-_KNOWN = 1e9  # condition of a pose's information by its landmarks from which on they do not determine it
 _SAME = 0.5  # share of a pose's landmarks that another one must measure to say nothing new
 _ALONE: tuple[Array, Array] = np.zeros((12, 12)), np.zeros((6, 12))  # `pair` and `shared` of a first pose
 
@@ -135,7 +134,7 @@ class Steps(RectifiedMeasurement):
             P = _in_world(s, found.T, np.zeros((6, 6)), np.linalg.inv(one.information + G.T @ G))
             P = world_covariance(s.spread[-1]) if marks.world[seen].any() else P
             return self._anew(s, graph, found.T, P, seen, z[used])
-        known = np.linalg.cond(G.T @ G) < _KNOWN
+        known = np.linalg.eigvals(np.linalg.solve(one.information, G.T @ G)).real.min() > 1  # better than the motion
         if self.config.poses == "seen" and known and self._saw_the_same(s, marks.serial[seen]):
             return _aside(s, found.T, G.T @ G, by_rig), nis, ""
         linear = math.sqrt(self.stereo.f / self.models.pixel_sigma)
@@ -269,13 +268,16 @@ def _aside(s: SmootherState, T: Array, information: Array, by_rig: Array) -> Smo
     """
     before = np.linalg.inv(s.own)
     less = before - before @ np.linalg.inv(before + information) @ before
+    gain = s.pair[:6, 6:] @ before
+    earlier = s.poses[-2] @ exp(gain @ log(inverse(s.poses[-1]) @ T))
     pair, shared = (P - P[:, 6:] @ less @ s.pair[6:] for P in (s.pair, s.shared))
     pair = 0.5 * (pair + pair.T)
     one = Aside(s.anchor, inverse(s.poses[s.of(s.anchor)]) @ T, np.linalg.inv(information), pair[6:, 6:])
     P = _in_world(s, T, shared[:, 6:], pair[6:, 6:])
     return replace(
-        s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread[:-1], P[None]]),
-        pair=pair, shared=shared, by_rig=np.concatenate([s.by_rig[:6], by_rig]),
+        s, poses=np.concatenate([s.poses[:-2], earlier[None], T[None]]),
+        spread=np.concatenate([s.spread[:-1], P[None]]), pair=pair, shared=shared,
+        by_rig=np.concatenate([s.by_rig[:6] + gain @ (by_rig - s.by_rig[6:]), by_rig]),
         aside={**s.aside, s.number: one},
     )  # fmt: skip
 

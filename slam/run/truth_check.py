@@ -57,7 +57,7 @@ def truth_doubt(own: Trajectory, truth: Trajectory) -> str:
     if len(own) > _ROWS:
         own = own.select(np.linspace(0, len(own) - 1, _ROWS).astype(int))
     given = _fit(own, truth, 0.0, free="")
-    if given is None:
+    if given is None or given.error < _EXPLAINS * _FINE:  # errors are no less than _FINE
         return ""
     w_first = quaternion(truth.poses[:, :3, :3])[:, [1, 2, 3, 0]]
     as_w_first = pose(rotation_from_quaternion(w_first), truth.positions)

@@ -75,6 +75,16 @@ def test_a_failing_back_end_is_named_with_its_own_line_and_the_cause_is_kept():
     assert isinstance(raised.value.__cause__, np.linalg.LinAlgError)
 
 
+class Quits(EkfBackend):
+    def predict(self, stamp):
+        raise SystemExit(0)
+
+
+def test_a_back_end_that_ends_the_program_is_named():
+    with pytest.raises(PartError, match=r"^frame 0: Quits failed: SystemExit"):
+        StereoSlam(RIG, "surf", Quits(RIG, models=EstimatorModels())).process(LEFT, RIGHT, 0.0)
+
+
 class Blind(SurfFrontend):
     def extract(self, frame):
         raise StopIteration
