@@ -44,7 +44,7 @@ FAULTS = (
         "tests/backends/test_ekf_parts.py tests/backends/test_ekf.py",
     ),
     Fault(
-        "the last poses are corrected as if they were in the state", "backends/ekf/covariance.py",
+        "what has left the state is corrected as if it were in it", "backends/ekf/covariance.py",
         "P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]", "by_rig[last] = self.by_rig[last]",
         "tests/backends/test_ekf_parts.py tests/backends/test_all_backends.py tests/backends/test_ekf.py",
     ),

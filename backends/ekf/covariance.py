@@ -1,8 +1,10 @@
-"""The filter's covariance: one dense matrix of camera, last poses and landmarks.
+"""The filter's covariance: of what is in the state, and of what has left it.
 
-The camera's last poses stay as they were believed in their time (stochastic clones): their gain is zero, as in the
-filter of Schmidt, whose covariance is exact for what it does. So their covariances with the rest go on, and those among
-themselves do not change.
+A landmark that has left is parked: it is corrected no more, but its error's covariance with the state goes on, as in
+the filter of Schmidt, whose covariance is exact for what it does. With the gain of such a landmark zero, ``P_AA``
+changes as ever, ``P_Ab ← (1 − K H) P_Ab`` and ``P_bb`` not at all. When it is measured again it joins the state with
+its covariances.
+The camera's last poses, as they were believed in their time, are kept in the same way (stochastic clones).
 What is known of a landmark from elsewhere is independent of all else until it is measured: nothing need be carried.
 
 Errors of the rig (`slam.interfaces.ConsideringBackend`) are considered, too, but not estimated. What is kept are the
@@ -29,15 +31,16 @@ _BLOCK = 64  # cost: rows that are mirrored at once
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Of ``[camera (12), last poses (24), landmarks of the state (3A)]``, n numbers.
+    """Of ``[camera (12), last poses (24), B landmarks that are parked (3B), A that are in the state (3A)]``, n numbers.
 
-    The poses are perturbed on the right, the newest first; zero before there are so many. The table of landmarks begins
-    with those of the state; behind them are those that are known from elsewhere.
+    The poses are perturbed on the right, the newest first; zero before there are so many. Rows of the table of
+    landmarks are in this order; behind them are those that are known from elsewhere.
     """
 
     P: Array  # (n, n)
     by_rig: Array  # derivatives (n, m) of all errors by those of the rig
     known: Array  # (C, 3, 3), of each landmark that is independent of all else
+    parked: int = 0  # B
 
     @classmethod
     def of_camera(cls, P: Array, by_rig: Array | None = None) -> Covariance:
@@ -46,8 +49,13 @@ class Covariance:
         return cls(np.pad(P, more), np.pad(by_rig, (more, (0, 0))), np.zeros((0, 3, 3)))
 
     @property
+    def begin(self) -> int:
+        """36 + 3B: where the landmarks of the state begin."""
+        return HEAD + 3 * self.parked
+
+    @property
     def correlated(self) -> int:
-        """A: the landmarks after these are known from elsewhere."""
+        """B + A: the landmarks after these are known from elsewhere."""
         return (len(self.P) - HEAD) // 3
 
     @property
@@ -130,22 +138,23 @@ class Covariance:
         moved = by_pose @ self.by_rig[:POSE] + by_rig.reshape(len(by_pose), -1)
         return replace(self, P=P, by_rig=np.concatenate([self.by_rig, moved]))
 
-    def rearranged(self, state: IndexArray, known: IndexArray) -> Covariance:
+    def rearranged(self, parked: IndexArray, state: IndexArray, known: IndexArray) -> Covariance:
         """With other landmarks in each of its parts, or fewer; by their rows of the table of landmarks."""
-        joining = np.flatnonzero(state >= self.correlated)
-        numbers = np.append(np.arange(HEAD), self.numbers(state)).clip(max=len(self.P) - 1)
+        rows = np.concatenate([parked, state])
+        joining = np.flatnonzero(rows >= self.correlated)
+        numbers = np.append(np.arange(HEAD), self.numbers(rows)).clip(max=len(self.P) - 1)
         P = np.ascontiguousarray(self.P[numbers].T)[numbers]  # rows alone are copied fast
         by_rig, at = self.by_rig[numbers], self.numbers(joining)
         P[at], P[:, at], by_rig[at] = 0.0, 0.0, 0.0
-        P[at[:, :, None], at[:, None, :]] = self.known[state[joining] - self.correlated]
-        return replace(self, P=P, by_rig=by_rig, known=self.known[known - self.correlated])
+        P[at[:, :, None], at[:, None, :]] = self.known[rows[joining] - self.correlated]
+        return replace(self, P=P, by_rig=by_rig, known=self.known[known - self.correlated], parked=len(parked))
 
     # --- an update ---
 
     def corrected(self, V: Array, lost_by_rig: Array, J: Array, shift: Array) -> Covariance:
         """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ = P − V Vᵀ`` (paper A, Eq. 11).
 
-        Last poses keep the covariance that they have among themselves.
+        Last poses and parked landmarks keep the covariance that they have among themselves.
 
         Args:
             V: ``P Hᵀ L⁻ᵀ`` (n, 3M), with ``S = L Lᵀ``.
@@ -153,10 +162,10 @@ class Covariance:
             J: the camera's error becomes J (12, 12) times what it was,
             shift: and then to those of the state's landmarks this (A, 3, 6) times that of the pose is added.
         """
-        last, by_rig, K = slice(CAMERA, HEAD), self.by_rig - V @ lost_by_rig, np.zeros((len(self.P), CAMERA))
+        last, by_rig, K = slice(CAMERA, self.begin), self.by_rig - V @ lost_by_rig, np.zeros((len(self.P), CAMERA))
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
         P[:CAMERA, :CAMERA] = mirrored(P[:CAMERA, :CAMERA])
-        K[:CAMERA], K[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
+        K[:CAMERA], K[self.begin :] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
         half = 0.5 * K @ P[:CAMERA, :CAMERA]  # T = 1 + [K, 0]:  T P Tᵀ = P + K Yᵀ + Y Kᵀ,  Y = P[:, :12] + K P_cc / 2
         P = dsyr2k(1.0, K, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
         by_rig += K @ by_rig[:CAMERA]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from backends.ekf import EkfBackend
-from backends.ekf.covariance import CAMERA, HEAD, Covariance
+from backends.ekf.covariance import CAMERA, Covariance
 from slam.data import Observations
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
@@ -30,7 +30,7 @@ def nees(backend: EkfBackend, truth: np.ndarray) -> float:
 
 def dense(covariance: Covariance) -> np.ndarray:
     """Of camera and landmarks of the state, as one matrix (12 + 3A, 12 + 3A)."""
-    kept = np.s_[CAMERA:HEAD]
+    kept = np.s_[CAMERA : covariance.begin]
     return np.delete(np.delete(covariance.P, kept, 0), kept, 1)
 
 
