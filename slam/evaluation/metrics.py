@@ -52,7 +52,7 @@ def associate(estimate: Trajectory, truth: Trajectory, tolerance: float = 0.02) 
     """Both paths at common stamps, row by row: the estimate's rows that have truth, and the truth for them.
 
     The truth is taken between two true poses: positions linearly, orientations at constant angular velocity. So it is
-    up to `tolerance` before the first one and after the last.
+    before the first one and after the last, up to `tolerance` and to their usual distance: farther, noise would grow.
 
     Args:
         estimate: the estimated path.
@@ -65,7 +65,7 @@ def associate(estimate: Trajectory, truth: Trajectory, tolerance: float = 0.02) 
     own, stamps = truth.stamps, estimate.stamps
     rows = np.zeros(0, int)
     if len(own):
-        outside = tolerance if len(own) > 1 else _ROUNDING
+        outside = min(tolerance, float(np.median(np.diff(own)))) if len(own) > 1 else _ROUNDING
         rows = np.flatnonzero((stamps >= own[0] - outside) & (stamps <= own[-1] + outside))
         after = np.searchsorted(own, stamps[rows]).clip(min(1, len(own) - 1), len(own) - 1)
         before = (after - 1).clip(0)

@@ -121,25 +121,12 @@ def results_of(
 ) -> dict[str, Any]:
     """The part of a summary that says how good the run was; frames whose pose was not measured are in no error."""
     measured, path = np.array(record.measured), record.trajectory
-    if missing := int((~np.isin(path.stamps, final.stamps)).sum()) if len(final) else 0:
-        logger.warning(
-            "the back end's trajectory() lacks %d of %d frames: it needs a pose for each", missing, len(path)
-        )
-    if len(final) and final.stamps[-1] == path.stamps[-1]:
-        apart = float(np.linalg.norm(final.positions[-1] - path.positions[-1]))
-        if apart > _DISAGREE * path.length:
-            logger.warning("the back end's estimate() and trajectory() are %.3g m apart in the last frame", apart)
-    none = int((~are_covariances(np.array(record.covariances[1:]).reshape(-1, 6, 6))).sum())
-    if none:
-        logger.warning(
-            "the back end claims a singular covariance for %d of %d poses: it is no uncertainty", none, len(path)
-        )
+    singular = _singular(record, final)
     online, steps = path.select(measured), np.diff(path.positions, axis=0)
-    truth, noise = sequence.ground_truth, getattr(sequence, "truth_noise", TruthNoise())
-    doubt = ""
+    noise, doubt = getattr(sequence, "truth_noise", TruthNoise()), ""
     exact = noise == TruthNoise() and sequence.format != "synthetic"  # the truth is taken as such
-    if truth is not None and exact and not getattr(system, "doubt", ""):  # a path that is doubted tells nothing of it
-        doubt = truth_doubt(online, truth)
+    if sequence.ground_truth is not None and exact and not getattr(system, "doubt", ""):  # else the path tells nothing
+        doubt = truth_doubt(online, sequence.ground_truth)
     if doubt:
         logger.warning("%s", doubt)
     speeds = np.linalg.norm(steps, axis=1) / np.diff(path.stamps)
@@ -160,8 +147,8 @@ def results_of(
             **({} if doubt else consistency(online, np.array(record.covariances)[measured], sequence, common)),
         },
     }
-    if none:
-        found["consistency"]["singular covariances"] = none
+    if singular:
+        found["consistency"]["singular covariances"] = singular
     if found["accuracy"]["online"]:  # for the picture's band, which is that of the verdict
         found["truth"] = asdict(noise)
     if doubt:
@@ -178,6 +165,25 @@ def results_of(
     if score is not None:
         found["objects"] = score.summary()
     return found | _times(record)
+
+
+def _singular(record: RunRecord, final: Trajectory) -> int:
+    """In how many frames the back end claims no covariance; warns of them, and of paths that do not fit together."""
+    path = record.trajectory
+    if missing := int((~np.isin(path.stamps, final.stamps)).sum()) if len(final) else 0:
+        logger.warning(
+            "the back end's trajectory() lacks %d of %d frames: it needs a pose for each", missing, len(path)
+        )
+    if len(final) and final.stamps[-1] == path.stamps[-1]:
+        apart = float(np.linalg.norm(final.positions[-1] - path.positions[-1]))
+        if apart > _DISAGREE * path.length:
+            logger.warning("the back end's estimate() and trajectory() are %.3g m apart in the last frame", apart)
+    singular = int((~are_covariances(np.array(record.covariances[1:]).reshape(-1, 6, 6))).sum())
+    if singular:
+        logger.warning(
+            "the back end claims a singular covariance for %d of %d poses: it is no uncertainty", singular, len(path)
+        )
+    return singular
 
 
 def _times(record: RunRecord) -> dict[str, Any]:

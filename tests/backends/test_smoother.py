@@ -17,7 +17,7 @@ from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels, MotionModel
 from slam.window import motion
 from slam.window.stereo import RectifiedStereo
-from tests.backends.scenes import RIG, path, run, scene, step
+from tests.backends.scenes import RIG, path, random_path, run, scene, step
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
 DT = 0.1
@@ -130,6 +130,24 @@ def test_frames_that_measured_nothing_are_no_failure(lag, dark):
     off = se3.log(se3.inverse(last.T_world_left) @ data.poses[-1])
     assert off @ np.linalg.solve(last.covariance, off) < 25
     assert lag < 4 or np.sqrt(np.trace(last.covariance[3:, 3:])) < 0.04
+
+
+def test_a_pose_that_is_solved_for_aside_tells_of_the_one_before_it():
+    """After frames in the dark, the velocity was that of a pose which had not been moved along, and said to be sure."""
+    models, nees = EstimatorModels(MotionModel(1.0, 1.0), pixel_sigma=0.5), []
+    for seed in range(30):
+        poses = random_path(20, DT, np.zeros(3), models.motion, np.random.default_rng(seed))
+        data, backend, known = scene(poses, points=150, seed=seed), SmootherBackend(RIG, models, poses="seen"), set()
+        for k, (stamp, T, seen) in enumerate(data):
+            if 10 <= k < 14 or k == 15:
+                off = se3.log(se3.inverse(backend.predict(stamp).T_world_left) @ T)
+                if k == 15:
+                    nees.append(off @ np.linalg.solve(backend.estimate(landmarks=False).covariance, off))
+                    break
+                backend.update(Observations.empty())
+            else:
+                step(backend, stamp, seen, known)
+    assert np.mean(nees) < 10
 
 
 @pytest.mark.parametrize("lag", [4, None])

@@ -49,6 +49,12 @@ def test_the_first_step_that_gave_too_little_is_the_cause(features, baseline, mo
     assert said.startswith(f"no frame after the first was tracked; likely cause: {words}")
 
 
+def test_a_few_frames_that_were_not_tracked_are_no_bad_run():
+    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
+    assert not outcome(record(18), rig)
+    assert outcome(record(17), rig).startswith("3 of 21")
+
+
 def moving(times_too_short: float, frames: int = 40) -> RunRecord:
     """A camera in a hand: its velocity changes as the motion model says, its stamps may be wrong."""
     rng = np.random.default_rng(0)
