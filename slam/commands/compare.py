@@ -104,8 +104,7 @@ def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
                 return None
             tried[trial.sequence] = result["milliseconds"]
         times = tried[trial.sequence]
-        images = (
-            times.get("read", 0.0) + times.get("extract", 0.0) if trial.mode != CLOSED_LOOP else 0.0
-        )  # of no replay
-        seconds += 1e-3 * frames[trial.sequence] * (times.get("total", 0.0) - images)
+        spared = () if trial.mode == CLOSED_LOOP else ("read", "extract")  # a replay has no images
+        a_frame = times.get("total", 0.0) - sum(times.get(stage, 0.0) for stage in spared)
+        seconds += 1e-3 * frames[trial.sequence] * a_frame
     return seconds
