@@ -15,7 +15,6 @@ from scipy.linalg.lapack import dpotrf
 
 from backends.ekf.covariance import CAMERA, POSE
 from backends.ekf.innovation import Linearisation, Solution, Update
-from slam.chi_square import chi_square_limits
 from slam.data import BoolArray
 from slam.geometry.se3 import Array
 from slam.window.gating import squared_distances
@@ -44,7 +43,7 @@ def gate(update: Update, T: Array | None = None) -> Gated:
     Raises LinAlgError where S is not positive definite.
     """
     at = update.linearised(None if T is None else update.camera.at(T))
-    limits = chi_square_limits(np.isfinite(update.z).sum(axis=1), update.measure.models.gate_probability)
+    limits = update.measure.limits(update.z)
     own = squared_distances(at.nu.reshape(-1, 3), _blocks(at.S))
     if not np.isfinite(own).all():
         raise LinAlgError("the predicted innovations are not finite or not positive definite")
