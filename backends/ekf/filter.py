@@ -141,7 +141,7 @@ class LandmarkFilter:
         anchors = np.tile(np.eye(3, 4), (len(ids), 1, 1))
         anchors[:, :, 3] = positions
         anchors[:, 2, 3] -= np.maximum(_STAND_OFF * np.sqrt(np.trace(covariances, axis1=1, axis2=2)), 1.0)
-        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, s.frame, np.pi)
+        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, np.pi)
         D = self._coordinates.inverse_jacobian(anchors, new.c)
         self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
 
@@ -207,7 +207,7 @@ class LandmarkFilter:
 
         Features slide as the viewpoint changes: this widens the landmarks in view (`FilterState.slid`).
         """
-        s = self.state.relieved()
+        s = self.state
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
         if s.frame < 0:
             after = replace(s, stamp=float(stamp), frame=0, closed=False)

@@ -16,7 +16,7 @@ from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from backends.ekf.camera import Camera
-from backends.ekf.covariance import CAMERA, POSE, Covariance
+from backends.ekf.covariance import CAMERA, HEAD, POSE, Covariance
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
@@ -58,7 +58,7 @@ class Update:
     @cached_property
     def measured(self) -> IndexArray:
         """And in a change of the state (12 + 3A,), which is of the camera and the landmarks in it."""
-        return np.append(np.arange(POSE), self.numbers[POSE:] - self.covariance.begin + CAMERA)
+        return np.append(np.arange(POSE), self.numbers[POSE:] - HEAD + CAMERA)
 
     @cached_property
     def lever(self) -> Array:
@@ -90,7 +90,7 @@ class Update:
         """
         there, marks = camera or self.camera, self.landmarks
         J = np.eye(CAMERA) if camera is None else self.camera.transport(camera)
-        change = np.zeros(CAMERA + len(self.covariance.P) - self.covariance.begin)
+        change = np.zeros(CAMERA + len(self.covariance.P) - HEAD)
         if camera is not None:
             change[:CAMERA] = np.linalg.solve(J, there.minus(self.camera))
         if moved is not None:
@@ -194,7 +194,7 @@ class Solution:
     @cached_property
     def change(self) -> Array:
         """Of the state (n,) from the prior, in the prior's coordinates: ``K ν = P Hᵀ y``."""
-        return np.delete(self.y @ self.at.HP[self.rows], np.s_[CAMERA : self.at.update.covariance.begin])
+        return np.delete(self.y @ self.at.HP[self.rows], np.s_[CAMERA:HEAD])
 
     @cached_property
     def camera(self) -> Camera:
