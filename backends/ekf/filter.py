@@ -247,7 +247,7 @@ class LandmarkFilter:
             return landmarks_pose(measure, update.landmarks.points, z, T, s.frame + 1)
 
         try:
-            found = agreement(update, search)
+            found = agreement(update, guess, search)
             if found is None:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids.copy())

@@ -37,7 +37,6 @@ class Update:
     measure: RectifiedMeasurement  # what they measure, their noise, and the gate
     coordinates: Coordinates
     iterations: int  # most linearisations
-    guess: Array | None = None  # a pose (4, 4) to linearise at where it is not linear from the prior on
 
     @property
     def sigma(self) -> float:
@@ -45,10 +44,11 @@ class Update:
         return self.measure.models.pixel_sigma
 
     def facing(self, T: Array) -> Update:
-        """With a guess T (4, 4), and the same prior in coordinates that are regular from there to here."""
+        """The same prior in coordinates that are regular from a pose T (4, 4) to here; itself where they are."""
         camera, J = self.camera.facing(T)
-        P = self.covariance if camera is self.camera else self.covariance.camera_moved(J, np.zeros((CAMERA, CAMERA)))
-        return replace(self, camera=camera, covariance=P, guess=T)
+        if camera is self.camera:
+            return self
+        return replace(self, camera=camera, covariance=self.covariance.camera_moved(J, np.zeros((CAMERA, CAMERA))))
 
     @cached_property
     def numbers(self) -> IndexArray:
