@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from backends.ekf.camera import Camera, moved
+from backends.ekf.camera import Camera, predicted
 from backends.ekf.covariance import CAMERA, POSE, RECENT, Covariance, positive
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
@@ -212,14 +212,14 @@ class LandmarkFilter:
         if s.frame < 0:
             after = replace(s, stamp=float(stamp), frame=0, closed=False)
         else:
-            motion = moved(s.camera, self.models, s.covariance.camera, stamp - s.stamp, rests)
+            motion = predicted(s.camera, self.models, s.covariance.camera, stamp - s.stamp, rests)
             after = s.advanced(float(stamp), motion)
         T, rows = after.pose, self._measure.visible(after.pose, after.landmarks.points)
         after = after.slid(self._coordinates, rows, self.models.slide.density / self._measure.stereo.f)
         marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
-        A = -toward @ (marks.gauge @ after.camera.displacement())  # derivatives (M, 3, 6) of them, seen from the camera
-        seen = (A @ after.covariance.pose + 2 * toward @ cross) @ A.transpose(0, 2, 1)
+        by_pose = -toward @ (marks.gauge @ after.camera.displacement())  # (M, 3, 6), of them as seen from the camera
+        seen = (by_pose @ after.covariance.pose + 2 * toward @ cross) @ by_pose.transpose(0, 2, 1)
         seen = 0.5 * (seen + seen.transpose(0, 2, 1)) + toward @ blocks @ toward.transpose(0, 2, 1)
         left, right, S = self._measure.pixels((marks.points - T[:3, 3]) @ T[:3, :3], seen)
         prediction = Prediction(after.stamp, T.copy(), after.pose_covariance(), marks.ids, left, right, S)

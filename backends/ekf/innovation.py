@@ -1,4 +1,4 @@
-"""What an update measures, linearised: ``z = h(x)`` and H (paper A, Eqs. 5-10; B, Eqs. 1-5), ν and ``S = H P Hᵀ + R``.
+"""What an update measures, linearised: ``z = h(x)`` and H (paper A, Eqs. 5-7; B, Eqs. 1-5), ν and ``S = H P Hᵀ + R``.
 
 A landmark's measurement depends on where it is as seen from the camera alone. An error x of the camera's pose moves it
 there by ``−lever x`` in its own coordinates, so that ``H = own [−lever, 1]`` has columns for the pose and the
@@ -103,7 +103,8 @@ class Update:
         seen = np.isfinite(self.z) & np.isfinite(z).all(axis=1, keepdims=True)
         own = by_point @ (R.T @ self.coordinates.jacobian(marks.anchors, marks.c))
         own = np.where(seen[:, :, None], own, 0.0)
-        lever = self.lever if camera is None is moved else marks.gauge @ (there.displacement() @ J[:POSE, :POSE])
+        # an error that is transported displaces the world by the same, wherever it is written
+        lever = marks.gauge @ (self.camera if self.camera.transports else there).displacement()
         return Linearisation(self, there, J, change, z, seen, own, lever)
 
 

@@ -31,10 +31,10 @@ Search = Callable[[], "Array | None"]
 def agreement(update: Update, guess: Array | None, search: Search) -> Solution | None:
     """Solve with the prior, or where it fails the pose, that most observations agree with; None where there is none.
 
-    It is linearised at the prior, then at the guess, a pose (4, 4), if there is one. Where less than a third of the observations
-    agrees, and as many wrong ones might agree by chance, that agreement is ignored: it could move the pose anywhere. A
-    smaller agreement than that of most counts only if nothing else is found. `search` is only called where nothing else
-    helps. Raises LinAlgError where the reason is numerical.
+    It is linearised at the prior, then at the guess, a pose (4, 4), if there is one. Where less than a third of the
+    observations agrees, and as many wrong ones might agree by chance, that agreement is ignored: it could move the pose
+    anywhere. An agreement of a minority counts only if nothing else is found. `search` is only called where nothing
+    else helps. Raises LinAlgError where the reason is numerical.
     """
     if not (np.isfinite(update.camera.pose).all() and math.isfinite(update.covariance.P.trace())):
         raise LinAlgError("the predicted state is not finite")

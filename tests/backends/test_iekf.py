@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from backends.ekf.camera import moved as motion
+from backends.ekf.camera import predicted as motion
 from backends.iekf import IekfBackend
 from backends.iekf.filter import InvariantCamera
 from experiments.corridor import run as corridor
