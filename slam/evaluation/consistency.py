@@ -4,7 +4,9 @@ With ``T_true = T_estimated exp(e)`` the error of the relative pose from frame i
 ``e_j − A e_i`` with ``A = Ad((T_i⁻¹ T_j)⁻¹)``. Errors of odometry by noise grow by increments that do not depend on
 what was before, so the covariance of that difference is ``N_j − A N_i Aᵀ``. Errors of the rig are the same in all
 frames: poses are off by ``J_i δ``, so they add ``(J_j − A J_i) Σ (J_j − A J_i)ᵀ`` with Σ as known in frame j. Where an
-old place is measured again the former may not be positive definite; such stretches are left out and counted.
+old place is measured again, or the frames' own errors are as large as the growth between them, the former may not be
+positive definite; such stretches are left out and counted. Where they are most of a length's it has no figure: the rest
+are those whose covariance happens to be small.
 
 Truth has errors of its own, the first pose included: else its turn would count as an error of the whole path. Their
 covariance is added, and stretches over which the truth contradicts itself are left out
@@ -40,6 +42,7 @@ BEFORE = "poses before the truth"
 
 _DOF = 6
 _SMALLEST = 1e-12  # eigenvalue of a covariance [rad², m²] below which it is none
+_MOST = 0.5  # share of the stretches without a covariance above which a length has no figure
 _ROUNDING = 1e-14  # eigenvalues below this share of the largest are rounding
 
 
@@ -74,13 +77,13 @@ def consistency_figures(
         starts = np.flatnonzero(last < len(own))
         values = stretch_nees(own, true, covariances, noise, starts, last[starts], common)
         values[closed[starts] != closed[last[starts]]] = np.nan
-        if np.isfinite(values).any():
+        left_out = doubtful(true, noise, starts, last[starts])
+        none = ~np.isfinite(values) & ~left_out
+        if np.isfinite(values).any() and none.mean() <= _MOST:
             figures[f"NEES over {length:g} m"] = _mean(values)
             if noisy:
                 of_exact = stretch_nees(own, true, covariances, exact, starts, last[starts], common)
                 figures[f"NEES over {length:g} m, truth exact"] = _mean(of_exact[np.isfinite(values)])
-        left_out = doubtful(true, noise, starts, last[starts])
-        none = ~np.isfinite(values) & ~left_out
         for what, rows in (("doubtful truth", left_out), ("no covariance", none)):
             if rows.any():
                 figures[f"{what} over {length:g} m"] = float(np.mean(rows))
