@@ -12,7 +12,7 @@ from backends.smoother.config import SmootherConfig
 from backends.smoother.factors import FactorMaker
 from backends.smoother.graph import Graph
 from backends.smoother.mending import corrected, rebuilt
-from backends.smoother.path import Path, recent
+from backends.smoother.path import Path
 from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
 from slam.bounds import from_options
@@ -128,7 +128,9 @@ class SmootherBackend:
     @one_blas_thread
     def recent(self, n: int) -> RecentPoses:
         """The last camera poses, at most n and as many as are in the graph, with their joint covariance."""
-        return recent(self._started("recent"), self._graph, require_recent("smoother", n))
+        s, n = self._started("recent"), require_recent("smoother", n)
+        first, P = self._graph.joint_covariance(s, max(s.begun, s.number + 1 - n), s.number)
+        return RecentPoses(s.stamps[s.of(first) :], s.poses[s.of(first) :], 0.5 * (P + P.T))
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:

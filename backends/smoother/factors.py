@@ -67,7 +67,7 @@ class FactorMaker:
         return gtsam.BetweenFactorPose3(pose_key(earlier), pose_key(later), to_pose3(relative), noise)
 
     def motion(self, keys: Sequence[int], dt: Array) -> gtsam.NonlinearFactor:
-        """The velocity between the last two poses is that before but for noise.
+        """The velocity between the last two poses is that before but for noise: the papers' motion on poses alone.
 
         gtsam linearises it where it linearises the rest: at other poses it would pull at the path as a whole, which
         nothing else holds. `keys` are three successive poses with the times `dt` (2,) [s] between them; or two of which
@@ -95,8 +95,8 @@ class FactorMaker:
         """A landmark eliminated from its measurements, of which two or more are needed and one with a right pixel.
 
         Both modes give the same information; the careful one takes longer, and does not throw where the landmark lies
-        behind a camera. Used in every frame, or with the quick one silent instead (``ZERO_ON_DEGENERACY``), a path of a
-        thousand frames of real tracks ran away.
+        behind a camera. That gtsam throws is wanted: with the careful mode in every frame, or with factors that fall
+        silent there (``ZERO_ON_DEGENERACY``), a path of a thousand frames of real tracks ran away.
         """
         factor = _Smart(self._noise, self._careful if careful else self._quick)
         factor.add(points, keys, self._K)

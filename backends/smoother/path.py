@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from backends.smoother.graph import Graph
 from backends.smoother.state import SmootherState
-from slam.data import RecentPoses
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 
@@ -32,9 +30,3 @@ class Path:
     def trajectory(self) -> Trajectory:
         """All of it."""
         return Trajectory(np.array(self._stamps), np.array(self._poses).reshape(-1, 4, 4))
-
-
-def recent(s: SmootherState, graph: Graph, count: int) -> RecentPoses:
-    """The last poses, at most so many, of those that are still smoothed."""
-    first, P = graph.joint_covariance(s, max(s.begun, s.number + 1 - count), s.number)
-    return RecentPoses(s.stamps[s.of(first) :], s.poses[s.of(first) :], 0.5 * (P + P.T))

@@ -106,7 +106,7 @@ class Tracks:
                 continue
             track = self._smart.get(serial)
             goes_on = track is not None and (
-                track.factor == factor if factor != VARIABLE else track.takes_any(first - 1)
+                track.factor == factor if factor != VARIABLE else track.takes_any(first - 1)  # it leaves after this one
             )
             if track is None or not goes_on:
                 self._smart[serial] = track = Track(factor)

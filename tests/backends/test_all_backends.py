@@ -10,7 +10,7 @@ import pytest
 
 import backends
 from backends.smoother.landmarks import SmootherLandmarks
-from experiments.long_run import Corridor, table
+from experiments.long_run import Corridor
 from experiments.long_run import run as walk
 from slam.data import Observations
 from slam.geometry import se3
@@ -168,7 +168,6 @@ def test_a_walk_in_which_the_map_is_replaced_again_and_again(name):
         assert c.failed == 0 and c.least > 0 and c.nees < 20
         assert c.landmarks <= 4 * 8 + 4  # those of 24 m were in the map in all
         assert c.error < 0.3  # of 24 m
-    assert "failed updates: 0." in table(checkpoints)
 
 
 def interrupt(call, number: int) -> bool:

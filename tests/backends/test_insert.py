@@ -124,12 +124,6 @@ def test_the_smoother_keeps_what_was_known_when_it_is_rebuilt(frames, atol):
     assert (deviations[0] > 0.97 * deviations[1]).all() and (deviations[0] < 2 * deviations[1]).all()
 
 
-def test_batch_counts_what_the_first_pose_measured_once():
-    scene = Scene(2)
-    found, window = (tracked(name, scene).estimate().covariance for name in ("batch", "window"))
-    np.testing.assert_allclose(np.sqrt(np.diag(found)), np.sqrt(np.diag(window)), rtol=0.03)
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_landmarks_placed_before_the_camera_move_with_its_pose(name):
     """With the camera's own place known to 5 cm, so is theirs; the next pose is known relative to them."""

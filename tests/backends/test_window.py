@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import pickle
 from dataclasses import replace
 
@@ -17,13 +16,7 @@ from slam.data import Observations
 from slam.evaluation.metrics import chi_square_band, nees, pose_residuals
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
-from slam.registry import BUILT_IN, ONLINE
 from tests.backends.scenes import RIG, begun_in_the_dark, cloud, observe, path, random_path, run, scene, step, steps_off
-
-
-def test_the_online_back_ends_are_all_but_the_one_that_solves_at_the_end_and_the_second_filter():
-    """What is shown where nobody chose; `iekf` is `ekf` but for the camera's motion, and is tested beside it."""
-    assert set(ONLINE) == set(BUILT_IN["backends"]) - {"batch", "iekf"}
 
 
 def test_a_path_longer_than_the_window_is_the_optimum():
@@ -113,12 +106,11 @@ def test_memory_does_not_grow_with_the_run():
     assert 1e6 * (last.beyond - first.beyond) < 4096 * 2000
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda backend: pickle.loads(pickle.dumps(backend))])
-@pytest.mark.parametrize("after", [0, 1, 30])
-def test_a_copy_goes_on_to_the_same_bytes(copied, after):
+@pytest.mark.parametrize("after", [0, 30])
+def test_a_copy_goes_on_to_the_same_bytes(after):
     backend, known = backends.create("window", WALK, models=MODELS), set()
     walk(backend, 0, after, np.random.default_rng(0), known)
-    other = copied(backend)
+    other = pickle.loads(pickle.dumps(backend))
     for each in (backend, other):
         walk(each, after, after + 12, np.random.default_rng(1), set(known))
         each.revise(lambda z: z + np.array([0.1, 0.0, 0.0]))
@@ -188,20 +180,6 @@ def test_a_landmark_known_in_the_world_is_as_uncertain_as_the_pose():
         prediction = backend.predict(0.0)
         deviations.append(np.sqrt(np.trace(prediction.innovation[0])))
     assert deviations[1] == pytest.approx(deviations[0], rel=0.05)
-
-
-def test_blind_for_longer_than_the_window_landmarks_become_as_uncertain_as_in_the_smoother():
-    deviations = {}
-    for name in ("smoother", "window"):
-        backend = backends.create(name, RIG, models=EstimatorModels(MotionModel(0.1, 0.02), pixel_sigma=0.5))
-        points = np.random.default_rng(0).uniform((-1, -1, 4), (1, 1, 8), (40, 3))
-        seen = Observations(np.arange(40), *RIG.project(points))
-        for k in range(30):
-            prediction = backend.predict(0.1 * k)
-            if k < 8:
-                backend.add(seen) if not k else backend.update(seen)
-        deviations[name] = np.median(np.sqrt(np.trace(prediction.innovation, axis1=1, axis2=2)))
-    assert deviations["window"] == pytest.approx(deviations["smoother"], rel=0.05)
 
 
 def test_landmarks_that_no_frame_measures_for_a_while_are_as_uncertain_as_in_the_smoother():
