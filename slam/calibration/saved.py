@@ -75,12 +75,9 @@ class SavedCalibration:
             covariance = np.array(tree["covariance"], float).reshape(len(rows), len(rows))
             text = tree.get("evidence")
             evidence = None if text is None else RigEvidence.from_text(text, len(rows))
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise CalibrationError(f"calibration: cannot be read: {' '.join(str(error).split())}") from error
-        try:
             rig = {name: float(tree["rig"][name]) for name in NUMBERS}
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise CalibrationError("calibration: it does not say of which rig it is") from error
+            raise CalibrationError(f"calibration: cannot be read: {' '.join(str(error).split())}") from error
         if not all(np.isfinite(numbers).all() for numbers in (mean, covariance, list(rig.values()))):
             raise CalibrationError("calibration: all its numbers must be finite")
         if names != RigModel.names:

@@ -56,8 +56,6 @@ def open_world(text: str, read_masks: ReadMasks | None = None) -> WorldSequence:
     text = text.removeprefix("synthetic:")
     name, _, query = text.partition("?")
     values = parse_query(name, query, options(name))
-    if values["mask"] and read_masks is None:
-        raise ConfigurationError(f"{name}: 'mask' is an option for slam.open_sequence alone")
     key = tuple(sorted((k, v) for k, v in values.items() if k not in _RECORDING_ONLY))
     world = _build(name, key)
     told, recorded = world.rig, world
@@ -67,7 +65,9 @@ def open_world(text: str, read_masks: ReadMasks | None = None) -> WorldSequence:
         true = StereoRig(left, right, so3_exp(np.full(3, turn)) @ told.R, told.b)
         recorded = replace(world, rig=true)
     sequence = WorldSequence(text, recorded, values, told)
-    if values["mask"] and read_masks is not None:
+    if values["mask"]:
+        if read_masks is None:
+            raise ConfigurationError(f"{name}: 'mask' is an option for slam.open_sequence alone")
         sequence.masks = read_masks(values["mask"], told)
     return sequence
 

@@ -102,7 +102,7 @@ def spoilt(tree, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.pop("rig"), "of which rig"),
+        (lambda t: t.pop("rig"), "cannot be read: 'rig'"),
         (lambda t: t.pop("parameters"), "neither a file of"),
         (lambda t: t["parameters"].pop(), "cannot be read"),
         (lambda t: t["parameters"][0].update(name="colour"), "not those of this version"),
