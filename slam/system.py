@@ -14,7 +14,6 @@ from slam.atlas.map_io import FIRST_FRAME, SavedMap
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.detector import MovingObjectDetector, ObjectDetector
 from slam.calibration import SavedCalibration, SelfCalibration
-from slam.calibration.conflict import FOCAL_WARNING
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError, SlamError
@@ -350,14 +349,14 @@ class StereoSlam:
     @property
     def warnings(self) -> list[str]:
         """Warnings about images, stamps, baseline or calibration, one line each (see `slam.input`)."""
-        said, doubt = self._extractor.input_warnings, self.doubt or self.calibration.doubt(FOCAL_WARNING)
+        said, doubt = self._extractor.input_warnings, self.doubt or self.calibration.warning
         lines = [*said.lines, *filter(None, [said.repeated])]
         return lines if doubt in ("", *lines) else [*lines, doubt]
 
     @property
     def doubt(self) -> str:
         """Why no path by these images can be trusted, one of the `warnings`; empty where nothing says so."""
-        return self._extractor.input_warnings.doubt or self._moment.doubt or self.calibration.doubt()
+        return self._extractor.input_warnings.doubt or self._moment.doubt or self.calibration.doubt
 
     def __getstate__(self) -> dict[str, object]:
         """State for copying and pickling; refused while another thread is in a step."""

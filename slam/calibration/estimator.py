@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from slam.calibration.config import SelfCalibrationConfig
-from slam.calibration.conflict import GAIN, conflict
+from slam.calibration.conflict import FOCAL_WARNING, GAIN, conflict
 from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.calibration.pairs import View, match, noise_variances, pair_evidence, pair_of, parallax
 from slam.calibration.posterior import (
@@ -109,11 +109,17 @@ class SelfCalibration:
         """The present posterior of the rig's error in this recording."""
         return RigPosterior(self._own.mean.copy(), self._own.covariance + self._by_bias)
 
-    def doubt(self, focal: float = GAIN) -> str:
-        """What the images contradict by far in the calibration, in a line; empty where they do not.
+    @property
+    def doubt(self) -> str:
+        """What the images contradict by far in the calibration, in a line; empty where they do not."""
+        return self._contradicted(GAIN)
 
-        A focal length counts from a gain `focal` on, see `slam.calibration.conflict`.
-        """
+    @property
+    def warning(self) -> str:
+        """As `doubt`, but also a focal length that the images contradict less surely."""
+        return self._contradicted(FOCAL_WARNING)
+
+    def _contradicted(self, focal: float) -> str:
         rows, moved = self._rows.total(), self._moved()
         if rows is None:
             return ""

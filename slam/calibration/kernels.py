@@ -119,7 +119,7 @@ def fit(first, second, R, t, focal, noise, median, steps):
         last = _correct(first, *at[1:], step, noise, points)
         if not last >= 1e-3:  # 1e-3: [px]; at 0.02 focal lengths were wrong by percents
             break
-    return R, t, points, at, weights, last
+    return (R, t, points, *at, weights), last
 
 
 @helper
@@ -164,7 +164,7 @@ def _correct(first, J_point, J_motion, residual, information, step, noise, point
 
 @helper
 def _linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motion, residual, information):
-    """Fill in what `slam.calibration.pairs.Fit` has of each point, at a motion and estimates of the first view's points."""
+    """Fill in what `slam.calibration.pairs.Fit` has, at a motion and estimates of the first view's points."""
     by_all, by_depth, B, C = np.empty((3, 9)), np.empty(9), np.empty((3, 3)), np.empty((3, 3))
     for p in range(len(points)):
         x, y, d = points[p, 0], points[p, 1], points[p, 2]

@@ -202,5 +202,5 @@ def _fitted(
 ) -> tuple[Fit, float]:
     """The motion after `steps` at most, and the last change of a predicted point [px], infinite without a solution."""
     arrays = (np.ascontiguousarray(a, float) for a in (first, second, R, t))
-    R, t, points, at, weights, last = kernels.fit(*arrays, focal, noise, _MEDIAN_3, steps)
-    return Fit(R, t, points, *at, weights), float(last)
+    found, last = kernels.fit(*arrays, focal, noise, _MEDIAN_3, steps)
+    return Fit(*found), float(last)

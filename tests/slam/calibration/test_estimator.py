@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from slam.calibration import RigCorrection, RigModel, RigPosterior, SelfCalibration, SelfCalibrationConfig
-from slam.calibration.conflict import FOCAL_WARNING
 from slam.calibration.posterior import prior_information
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
@@ -94,7 +93,7 @@ def test_a_common_error_of_the_focal_lengths_is_found_in_a_turn(theta):
     mean, sigma = common_focal(calibration)
     assert abs(mean - 0.005) < 3 * sigma < 0.0075
     assert mean > (0.001 if theta[-4] else 0.0025)
-    assert calibration.doubt() == ""
+    assert calibration.doubt == ""
 
 
 @pytest.mark.parametrize(
@@ -110,13 +109,13 @@ def test_a_common_error_of_the_focal_lengths_is_found_in_a_turn(theta):
 def test_what_no_calibration_of_this_camera_has_is_named(share, wrong, words):
     camera = CAR.left
     rig = type(CAR).rectified_pair(share * camera.fu, camera.u0, camera.v0, CAR.baseline, CAR.width, CAR.height)
-    assert words in quarter_turn(parameters(**wrong), rig).doubt()
+    assert words in quarter_turn(parameters(**wrong), rig).doubt
 
 
 @pytest.mark.parametrize(("share", "words"), [(1.1, "% shorter than"), (0.9, "% longer than"), (1.0, "")])
 def test_a_focal_length_that_is_a_tenth_wrong_is_warned_of(share, words):
     rig = CAR.rectified_pair(share * CAR.left.fu, CAR.left.u0, CAR.left.v0, CAR.baseline, CAR.width, CAR.height)
-    said = quarter_turn(parameters(), rig).doubt(FOCAL_WARNING)
+    said = quarter_turn(parameters(), rig).warning
     assert words in said and bool(said) == bool(words)
 
 
