@@ -56,7 +56,7 @@ def test_a_world_and_a_format_of_one_s_own_are_opened_by_module_and_name(tmp_pat
     assert read.rig.baseline == world.rig.baseline and read.stamps == pytest.approx(world.stamps + 1, abs=1e-3)
     for one, other in zip(world, read, strict=True):
         np.testing.assert_array_equal(one.right, other.right)
-    with pytest.raises(SlamError, match=r"is no slam\.worlds\.scenes\.Scene"):
+    with pytest.raises(SlamError, match=r"is no slam\.worlds\.world\.Scene"):
         slam.open_sequence("synthetic:hall:build")
     with pytest.raises(SlamError, match=r"format 'numpy:eye': TypeError"):
         slam.open_sequence(tmp_path, "numpy:eye")
