@@ -101,7 +101,7 @@ EXPERIMENTS = (
         "real_sequences", "recordings", "Real sequences", says="One run each, over all frames.",
         pictures={"paths": "From above, aligned with the true ones."},
     ),
-    Experiment("bars", "recordings", "The back ends beside each other"),
+    Experiment("bars", "recordings", "The back ends beside each other", left_out=("window / better",)),
     Experiment(
         "slide", "recordings", "The slide of features",
         says="Distance of a left pixel from the epipolar line of an earlier one of the same landmark [px], by the "
