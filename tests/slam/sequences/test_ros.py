@@ -141,16 +141,6 @@ def test_compressed_images(tmp_path: Path) -> None:
     assert seeds(sequence) == [(k, k + 10) for k in range(6)]
 
 
-def test_a_damaged_image_costs_its_frame_alone(tmp_path: Path) -> None:
-    store, rows = STORES[1], stereo(STORES[1])
-    for k, (topic, kind, time, message) in enumerate(rows):
-        if topic == LEFT and message.header.stamp.nanosec == (T0 + 2 * STEP) % 10**9:
-            rows[k] = (topic, kind, time, image(store, T0 + 2 * STEP, picture(2)[:, :32]))
-    sequence = slam.open_sequence(write(tmp_path / "hurt.bag", rows))
-    assert seeds(sequence) == [(k, k + 10) for k in (0, 1, 3, 4, 5)]
-    assert sequence.warnings == ["frame 2 skipped: /stereo/left/image_raw, message 2: image is 32x48, not 64x48"]
-
-
 def test_topics_can_be_named_and_a_missing_one_lists_those_there_are(bag: Path) -> None:
     assert np.allclose(slam.open_sequence(f"{bag}?left={LEFT}&right={RIGHT}&fps=3").stamps, np.arange(6) / 3)
     with pytest.raises(SequenceError, match=rf"/stereo/lft/image_raw: there is none .*mean '{LEFT}'.*{LEFT}, {RIGHT}"):
