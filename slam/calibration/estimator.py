@@ -38,15 +38,14 @@ from slam.calibration.posterior import (
 )
 from slam.calibration.saved import SavedCalibration, joint_calibration
 from slam.data import CommonError, Estimate, StereoFeatures
-from slam.errors import ConfigurationError
+from slam.errors import CalibrationError, ConfigurationError
 from slam.geometry.arrays import changed
 from slam.geometry.rig import StereoRig
-from slam.geometry.rig_numbers import rig_numbers
+from slam.geometry.rig_numbers import rig_difference, rig_numbers
 from slam.geometry.se3 import Array, adjoint
 from slam.interfaces import Backend, ConsideringBackend, RevisingBackend
 from slam.tracks.follow import Matches
 
-_BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: within a block of so many, errors are taken to be correlated
 _MOST_FEATURES = 1000  # cost: of a view, the strongest ones; half of the usual 800 made drives worse by a half
 
 #: Change of the correction, in standard deviations of the disparities' error, for a back end to revise its past.
@@ -73,7 +72,8 @@ class SelfCalibration:
             self._prior = self._own_prior = factory_prior(self.model)
             start = self._prior.covariances[-1]
         else:
-            kept.require_fits(rig)
+            if found := rig_difference(kept.rig, rig_numbers(rig)):
+                raise CalibrationError(f"the kept calibration is of another rig: {found}")
             if not config.enabled:
                 raise ConfigurationError("a kept calibration needs self_calibration.enabled=true")
             mean, covariance = kept.posterior.mean, kept.posterior.covariance
@@ -84,8 +84,8 @@ class SelfCalibration:
         # covariance (n, n) of its mean by what its evidence has in common: a systematic error, unknown residual fields
         self._by_bias = np.zeros_like(start)
         self._before = np.linalg.inv(start)  # information (n, n) without evidence
-        self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
-        self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
+        # 8, 4: frames, pairs, within a block of which errors are taken to be correlated
+        self._rows, self._motion = Accumulator(config.inflation, 8), Accumulator(config.inflation, 4)
         self._fields: Evidence | None = None  # of rows: parameters and residual fields
         self._far = self.model.field(self.model.far())[:, 2]  # disparities of far points by the parameters
         self._focal = along(self.model, *FOCALS) / 2  # the focal lengths' common error by the parameters
@@ -194,12 +194,10 @@ class SelfCalibration:
             self._update()
 
     def _has_turned(self, T_world_left: Array) -> bool:
-        """Whether the camera has rotated since the last frame that was used."""
-        if self._looked is None:
-            return True
-        cosine = 0.5 * (np.sum(T_world_left[:3, :3] * self._looked[:3, :3]) - 1)
+        """Whether the camera has rotated since the last frame that was used, by the cosine of the angle."""
         # 0.05: one frame at least per rotation by this angle [rad]: turns are rare, and alone show the focal length
-        return bool(cosine < np.cos(0.05))
+        least = 1 + 2 * np.cos(0.05)
+        return self._looked is None or bool(np.sum(T_world_left[:3, :3] * self._looked[:3, :3]) < least)
 
     def _compare(self, view: View) -> None:
         """Compare a view with the earlier ones, oldest first, until one still overlaps too much and keeps waiting."""

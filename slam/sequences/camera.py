@@ -80,8 +80,8 @@ class CameraSequence:
                 self.rig = read_rig(paths, (left.shape[1], left.shape[0]), options)
                 self._masks = read_masks(options.get("mask"), Path.cwd(), self.rig)
             except SequenceError as error:
-                hint = "; ask the camera for another size with width=… and height=…" if "images are" in str(error) else ""
-                raise SequenceError(f"{self.name}: {error}{hint}") from None
+                hint = "; ask the camera for another size with width=… and height=…"
+                raise SequenceError(f"{self.name}: {error}{hint if 'images are' in str(error) else ''}") from None
 
     def __len__(self) -> int:
         raise TypeError(f"{self.name}: a camera has no number of frames")
