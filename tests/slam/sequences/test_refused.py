@@ -87,22 +87,6 @@ def test_rows_that_are_no_stamps_or_in_wrong_order_cost_their_frames(euroc, kitt
         assert np.allclose(sequence.stamps, stamps) and words in sequence.warnings[0]
 
 
-def test_one_camera_ahead_of_the_other(euroc: Path, kitti: Path, build: SimpleNamespace) -> None:
-    stamps = [build.T0 + i * build.STEP for i in range(6)]
-    build.write_csv(euroc / "mav0" / "cam1", stamps[2:])
-    build.write_csv(euroc / "mav0" / "cam0", stamps[:5])
-    for name in ("image_1/000000.png", "image_1/000001.png", "image_0/000005.png"):
-        (kitti / name).unlink()
-    for folder in (euroc, kitti):
-        sequence = open_sequence(folder)
-        assert [f.right is not None for f in sequence] == [True] * 3
-        text = "\n".join(sequence.warnings)
-        assert "2 images before the first pair left out" in text
-        assert "1 image without a partner" in text
-    assert np.allclose(sequence.stamps, [0.2, 0.3, 0.4])
-    assert np.allclose(sequence.ground_truth.positions[:, 2], [3, 4.5, 6])
-
-
 def test_listed_images_that_are_missing_and_stamps_that_differ_a_little(euroc: Path, build: SimpleNamespace) -> None:
     stamps = [build.T0 + i * build.STEP for i in range(6)]
     rows = [f"{s + (-1) ** i * 4_000_000},{s}.png\n" for i, s in enumerate(stamps)]
