@@ -54,6 +54,7 @@ _SIGNIFICANT = 0.5
 #: Standard deviation of the baseline's length, as a share of it: the squares of a calibration board are known to some
 #: tenths of a percent. It scales the whole world, so images never show it.
 BASELINE = 0.002
+_NO_IDS = np.zeros(0, np.int64)
 
 
 class SelfCalibration:
@@ -254,8 +255,7 @@ class SelfCalibration:
     @property
     def _noise(self) -> Array:
         """Covariance (3, 3) of a point ``(x, y, d)`` [px²]."""
-        pixel, disparity = np.exp(self._variances)
-        return np.diag([pixel, pixel, disparity])
+        return np.diag(np.exp(self._variances)[[0, 0, 1]])
 
     def _evidence(self, first: View, second: View, matched: Matches) -> Evidence | None:
         """The evidence of a pair of views with matched features; None without a solution."""
@@ -337,7 +337,7 @@ class RemainingRigError:
             step = applied.parameters - self._measured_with.parameters
             self._revised = self._revised + step
             if isinstance(backend, ConsideringBackend):
-                self._turned = self._turned + _adjoint_of(backend) @ _of_pose(backend)[:, :-2] @ step
+                self._turned = self._turned + _adjoint_of(backend) @ backend.sensitivities(_NO_IDS)[0][:, :-2] @ step
         backend.revise(revision.rows)
         self._measured_with = applied
         return revision
@@ -366,7 +366,7 @@ class RemainingRigError:
         """
         if not (self._calibration.config.enabled and isinstance(backend, ConsideringBackend)):
             return CommonError()
-        J, revised = _of_pose(backend), self._revised
+        J, revised = backend.sensitivities(_NO_IDS)[0], self._revised
         if as_reported:
             J, revised = J.copy(), 0.0 * revised
             J[:, -1] -= J[:, :-2] @ self._revised
@@ -386,11 +386,6 @@ class RemainingRigError:
         root = np.diag(np.append(np.zeros(n), [BASELINE, 1.0]))
         root[:n, :n], root[:n, -1] = self._root[1], self._calibration.applied.parameters - revised
         return root
-
-
-def _of_pose(backend: ConsideringBackend) -> Array:
-    """J (6, n + 2) of the newest pose."""
-    return backend.sensitivities(np.zeros(0, np.int64))[0]
 
 
 def _adjoint_of(backend: Any) -> Array:

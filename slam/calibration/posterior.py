@@ -230,11 +230,6 @@ class Prior:
         """Inverses of the covariances (K, n, n)."""
         return np.linalg.inv(self.covariances)
 
-    @cached_property
-    def log_determinants(self) -> Array:
-        """Of the information (K,)."""
-        return np.asarray(np.linalg.slogdet(self.information)[1])
-
 
 def factory_prior(model: RigModel) -> Prior:
     """Prior of a calibration as delivered, by how calibrations are usually made."""
@@ -289,8 +284,7 @@ def systematic_variance(model: RigModel, error: float) -> Array:
     surfaces and moving shadows are matched with such a bias; it does not average out.
     """
     far = model.far()
-    near = far + np.array([0.0, 0.0, 0.05 * model.focal])
-    points = np.concatenate([far, near])
+    points = np.concatenate([far, far + np.array([0.0, 0.0, 0.05 * model.focal])])
     effect = np.square(model.field(points)[:, 2:]).sum(axis=1)
     return np.asarray(error**2 / effect.mean(axis=0))
 
@@ -331,7 +325,8 @@ def solve(prior: Prior, evidence: Evidence, known: Evidence | None = None) -> Ri
     """
     e, information = evidence.e - evidence.S @ prior.mean, prior.information + evidence.S
     fits = np.linalg.solve(information, np.broadcast_to(e[:, None], (len(information), len(e), 1)))[..., 0] @ e
-    logs = 0.5 * (prior.log_determinants - np.linalg.slogdet(information)[1] + fits)
+    before, after = (np.linalg.slogdet(matrices)[1] for matrices in (prior.information, information))
+    logs = 0.5 * (before - after + fits)
     weights = np.exp(logs - logs.max())
     known = evidence if known is None else known
     likely = weights > 1e-12  # numerics: of a scale, beside the likeliest
