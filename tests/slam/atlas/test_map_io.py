@@ -137,6 +137,10 @@ def test_new_landmarks_get_ids_that_no_keyframe_has():
 
 
 @pytest.mark.parametrize(("name", "value"), [
+    ("ids", np.zeros(2, np.int64)),
+    ("positions", np.full((1, 3), 1e300)),
+    ("covariances", np.zeros((1, 3, 3))),
+    ("descriptors", np.full((1, 16), np.inf, np.float32)),
     ("keyframe_stamps", np.zeros(3)),
     ("keyframe_poses", np.tile(2 * np.eye(4), (4, 1, 1))),
     ("keyframe_covariances", np.tile(-np.eye(6), (4, 1, 1))),
