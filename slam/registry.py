@@ -142,6 +142,7 @@ def options_of(made: Any, rig: Any) -> dict[str, tuple[Any, Any]]:
     They are the arguments of its constructor but the rig, ``models``, and functions, and where that takes any others
     the fields of its ``config``.
     """
+    made = getattr(made, "__wrapped__", made)  # behind `slam.guarded`
     try:
         parameters = list(signature(made).parameters.values())[1:]
         named = (p for p in parameters if p.kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY))
@@ -159,7 +160,8 @@ def require_methods(role: str, part: Any, name: str = "") -> Any:
     if isinstance(part, type):
         made = f"{part.__name__}(rig.rectified.rig)" if role == "backends" else f"{part.__name__}(rig)"
         raise ConfigurationError(f"{_spoken(role)} {part.__name__} is a class: give an instance, such as {made}")
-    missing = [method for method in METHODS[role] if not callable(getattr(part, method, None))]
+    own = getattr(part, "__wrapped__", part)  # behind `slam.guarded`, which has them all
+    missing = [method for method in METHODS[role] if not callable(getattr(own, method, None))]
     if missing and (part is not None or role == "backends"):
         what = f"{_spoken(role)} {name or type(part).__name__}"
         raise ConfigurationError(f"{what} is none: it lacks {', '.join(missing)}")

@@ -100,7 +100,7 @@ def common_options(version: _Version = False) -> None:
 @app.command("demo", short_help="Try three back ends on a built-in scene.")
 def demo_command(
     out: _Out = Path("slam_demo"),
-    frames: Annotated[int, option("Number of frames.", "N", min=10)] = 150,
+    frames: Annotated[int, option("Number of frames.", "N")] = 150,
     overwrite: _Overwrite = False,
     quiet: _Quiet = False,
 ) -> None:
@@ -239,7 +239,7 @@ def compare_command(
     frontend: Annotated[str, option("Front end; simulated: a world's own features, no images.", "NAME")] = "surf",
     settings: _Set = None,
     mask: _Mask = None,
-    trials: Annotated[int, option("Seeds 0 to N - 1 of every synthetic world.", "N", min=1)] = 12,
+    trials: Annotated[int, option("Seeds 0 to N - 1 of every synthetic world.", "N")] = 12,
     frames: _Frames = None,
     replay: Annotated[bool, option("Also feed the first back end's measurements to all.", None, "--replay")] = False,
     workers: Annotated[int | None, option("Processes; default: the number of cores.", "N")] = None,

@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from slam import registry
+from slam.commands.run import require_no_recording
 from slam.compare.plan import CLOSED_LOOP, Plan, Trial, is_world
 from slam.compare.report import write_report
 from slam.compare.sweep import Run, check, is_done, run_jobs, sweep
@@ -56,6 +57,7 @@ def compare(
     count = available_cores() if workers is None else workers
     if count < 1:
         raise ConfigurationError(f"comparison: workers must be 1 or more, got {count}")
+    require_no_recording(out)
     frames = check(plan, out, overwrite)  # before there is a progress bar
     total, done = sum(frames[trial.sequence] for trial in plan.every), 0
     limits = caution(plan, plan.trials if any(map(is_world, plan.sequences)) else 1)

@@ -24,7 +24,7 @@ from slam.run.options import RunOptions, parse_frames
 from slam.run.plots import leave_picture
 from slam.run.recording import Recording
 from slam.sequences import Sequence as StereoSequence
-from slam.sequences import is_live, open_sequence
+from slam.sequences import format_of, is_live, open_sequence
 from slam.settings import require_settable
 
 _BACKEND, _FRONTEND = "ekf", "surf"
@@ -110,6 +110,7 @@ def run_folder(out: Path | None, sequence: str, backend: str) -> Iterator[Path]:
     SlamError where none can be made.
     """
     if out is not None:
+        require_no_recording(out)
         yield out
         return
     for number in count(1):
@@ -127,6 +128,12 @@ def run_folder(out: Path | None, sequence: str, backend: str) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # it is not empty
             folder.rmdir()
+
+
+def require_no_recording(out: Path) -> None:
+    """Raise SlamError where the folder of a run or a comparison is that of a recording."""
+    if (found := format_of(out)) is not None:
+        raise SlamError(f"{out}: holds a recording (format {found}); give another --out")
 
 
 def _short(text: str) -> str:

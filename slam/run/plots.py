@@ -345,9 +345,11 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
         end = max(float(np.ptp(run.online.stamps)) for run in runs)  # also where the truth begins later
         axis.set_xlim(-0.01 * end, 1.01 * end or 1.0)
     axes[0].tick_params(labelbottom=False)
-    noisy = any(run.truth is not None and run.truth_noise != TruthNoise() for run in runs)
+    noises = [run.truth_noise for run in runs if run.truth is not None and not run.truth_is_exact]
     title = "Online error since the start (solid), claimed σ (dashed)"
-    title += "\nσ with that of the truth; grey: the truth is doubtful" if noisy else ""
+    if noises:
+        exact = all(noise == TruthNoise() for noise in noises)
+        title += "\nthe truth counts as exact" if exact else "\nσ with that of the truth; grey: the truth is doubtful"
     title += (
         "\nthe true path and the estimated one do not fit"
         if any(run.summary.get("truth_doubt") for run in runs)

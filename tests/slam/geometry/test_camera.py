@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.geometry.camera import PinholeCamera, size_doubt
+from slam.geometry.camera import PinholeCamera, oblong, size_doubt
 
 CAMERAS = {
     "ideal": PinholeCamera(260, 255, 160, 118, 320, 240),
@@ -71,3 +71,14 @@ def test_far_rays_are_not_folded_back_into_the_image():
 def test_a_principal_point_is_doubted_from_another_size_on_and_not_by_its_usual_scatter(x, y, doubted):
     camera = PinholeCamera(450, 450, x * 319.5, y * 239.5, 640, 480)
     assert bool(size_doubt(camera, camera)) == doubted
+
+
+@pytest.mark.parametrize(
+    ("fv", "x", "y", "words"),
+    [(450, 1.0, 1.12, "a height of about"), (450, 1.12, 1.0, "a width of"), (410, 1.0, 1.0, "focal lengths along rows"),
+     (450, 0.98, 0.924, ""), (450, 1.12, 1.12, "")],
+)  # fmt: skip
+def test_images_scaled_in_one_way_alone_are_asked_for(fv, x, y, words):
+    """By the pixels' shape, or by the principal point along one axis: 8 % off it is in recordings that are right."""
+    camera = PinholeCamera(450, fv, x * 319.5, y * 239.5, 640, 480)
+    assert words in oblong(camera, camera) and bool(words) == bool(oblong(camera, camera))
