@@ -63,11 +63,7 @@ def compare(
     limits = caution(plan, plan.trials if any(map(is_world, plan.sequences)) else 1)
     if not quiet:
         left = [trial for trial in plan.every if overwrite or not is_done(plan, trial, out)]
-        before = f", {len(plan.every) - len(left)} of them done before" if len(left) < len(plan.every) else ""
-        seconds = _seconds(left, frames) if left else None
-        about = "" if seconds is None else f": about {seconds / min(count, len(left)):.0f} s, by the first frames"
-        print(f"{len(plan.every)} runs{before}, {total} frames in all, {count} at a time{about}")
-        print(limits, flush=True)
+        print(f"{_work(plan, left, frames, count)}\n{limits}", flush=True)
     with counting(total, "frames", quiet) as tell:
 
         def ended(trial: Trial) -> None:
@@ -81,15 +77,28 @@ def compare(
     report = write_report(plan, every, runs, out, limits, command)
     if not quiet:
         print_conclusions(every)
-        failed = [run for run in runs if not run.completed]
-        told: dict[str, list[Run]] = {}
-        for run in runs:
-            for text in run.said if run.completed else [run.outcome]:
-                told.setdefault(f"{run.trial.sequence}: {text}", []).append(run)
-        for text, own in list(told.items())[:_NAMED]:
-            print(f"{text} ({', '.join(dict.fromkeys(run.trial.backend for run in own))}, {count_of(len(own), 'run')})")
-        print(f"Runs: {len(runs)}, {len(failed)} failed. Report: {report}")
+        _print_doubts(runs)
+        print(f"Runs: {len(runs)}, {sum(not run.completed for run in runs)} failed. Report: {report}")
     return runs
+
+
+def _print_doubts(runs: Sequence[Run]) -> None:
+    """Lines on runs that failed or are doubted, and on their warnings, each once with the runs that it holds for."""
+    told: dict[str, list[Run]] = {}
+    for run in runs:
+        for text in run.said if run.completed else [run.outcome]:
+            told.setdefault(f"{run.trial.sequence}: {text}", []).append(run)
+    for text, own in list(told.items())[:_NAMED]:
+        print(f"{text} ({', '.join(dict.fromkeys(run.trial.backend for run in own))}, {count_of(len(own), 'run')})")
+
+
+def _work(plan: Plan, left: Sequence[Trial], frames: Mapping[str, int], count: int) -> str:
+    """How much is to be run, `count` runs at a time, and how long what is `left` takes."""
+    before = f", {len(plan.every) - len(left)} of them done before" if len(left) < len(plan.every) else ""
+    seconds = _seconds(left, frames) if left else None
+    about = "" if seconds is None else f": about {seconds / min(count, len(left)):.0f} s, by the first frames"
+    total = sum(frames[trial.sequence] for trial in plan.every)
+    return f"{len(plan.every)} runs{before}, {total} frames in all, {count} at a time{about}"
 
 
 def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
