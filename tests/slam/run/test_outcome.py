@@ -24,21 +24,14 @@ def record(tracked: int, frames: int = 21, features: tuple[int, int] = (200, 150
     return RunRecord(statuses=statuses, features=[features] * frames)
 
 
-AGAIN = "features are found in both images, but not again in the next frame"
-
-
 @pytest.mark.parametrize(
     ("features", "baseline", "more", "words"),
     [
-        ((8, 8), 0.12, {}, "the images show hardly anything to follow (8 features in the median of these frames)"),
-        ((8, 8), 0.12, {"recorded": True}, "the run that was recorded was not tracked there: it has 8 measurements"),
+        ((8, 8), 0.12, {}, "the images show hardly anything to follow"),
         ((200, 3), 0.12, {}, "in the median of these frames 3 of 200 features are found in the right image"),
         ((200, 150), 120.0, {}, "the cameras are 120 m apart"),
-        ((200, 150), 0.12, {"dropped": 40}, "40 frames were dropped, and the frames about them are far apart"),
-        ((200, 150), 0.12, {"dropped": 1}, AGAIN),
-        ((200, 150), 0.12, {"dropped": 2, "warnings": ["A"]}, "A; and 2 frames were dropped, and the frames about"),
-        ((200, 150), 0.12, {}, AGAIN),
-        ((200, 150), 0.12, {"backend": "a:B"}, "the back end a:B (`python -m slam.testing a:B` checks it); or feat"),
+        ((200, 150), 0.12, {"dropped": 40}, "40 frames were dropped"),
+        ((200, 150), 0.12, {"dropped": 1, "backend": "a:B"}, "the back end a:B (`python -m slam.testing a:B` checks"),
         ((200, 0), 0.12, {"in_map": True}, "the camera is not where the map was made"),
         ((200, 3), 0.12, {"warnings": ["left and right look swapped", "more"]}, "left and right look swapped"),
     ],
@@ -50,9 +43,8 @@ def test_the_first_step_that_gave_too_little_is_the_cause(features, baseline, mo
 
 
 def test_a_few_frames_that_were_not_tracked_are_no_bad_run():
-    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
-    assert not outcome(record(18), rig)
-    assert outcome(record(17), rig).startswith("3 of 21")
+    assert not outcome(record(18), RIG)
+    assert outcome(record(17), RIG).startswith("3 of 21")
 
 
 def moving(times_too_short: float, frames: int = 40) -> RunRecord:
