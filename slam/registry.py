@@ -142,7 +142,6 @@ def options_of(made: Any, rig: Any) -> dict[str, tuple[Any, Any]]:
     They are the arguments of its constructor but the rig, ``models``, and functions, and where that takes any others
     the fields of its ``config``.
     """
-    made = getattr(made, "__wrapped__", made)  # behind `slam.guarded`
     try:
         parameters = list(signature(made).parameters.values())[1:]
         named = (p for p in parameters if p.kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY))

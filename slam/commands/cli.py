@@ -30,9 +30,9 @@ def option(help: str, metavar: str | None = None, *names: str, **more: Any) -> A
     return typer.Option(*names, metavar=metavar, help=help, **more)
 
 
-def argument(help: str, metavar: str, show_default: bool = False) -> Any:
+def argument(help: str, metavar: str) -> Any:
     """An argument of a command."""
-    return typer.Argument(metavar=metavar, help=help, show_default=show_default)
+    return typer.Argument(metavar=metavar, help=help, show_default=False)
 
 
 _File: TypeAlias = Path | None
