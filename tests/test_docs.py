@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import runpy
 import shlex
@@ -14,8 +13,6 @@ import numpy as np
 import pytest
 
 import slam
-from experiments.parameters import find
-from experiments.sensitivity import name_of
 from frontends.surf import SurfConfig
 from slam import worlds
 from slam.errors import SlamError
@@ -128,12 +125,6 @@ def test_api_pages_say_what_the_docstrings_say():
     for page in (DOCS / "api").glob("*.md"):
         text = page.read_text(encoding="utf-8")
         assert make_api.ROW.sub(make_api.row, text) == text, "python docs/make_api.py"
-
-
-def test_sensitivities_are_of_numbers_that_there_are():
-    present = {name_of(parameter) for parameter in find()}
-    stale = set(json.loads((DOCS / "sensitivity.json").read_text())["ratios"]) - present
-    assert not stale, "python experiments/parameters.py takes them out"
 
 
 SETTING = re.compile(r"[` ](models|association|map|atlas|self_calibration|objects|frontend)\.(?!csv)(\w+)[`=]")

@@ -13,7 +13,7 @@ import numpy as np
 from slam.errors import TrajectoryError
 from slam.files import read_text, write_text
 from slam.geometry.se3 import Array, nearest_rotation, pose, quaternion, rotation_from_quaternion, so3_exp
-from slam.naming import count, widest
+from slam.naming import count
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,7 +79,8 @@ class Trajectory:
             import matplotlib.pyplot as plt
 
             axis = plt.figure(layout="constrained").add_subplot()
-        across, up = map("xyz".index, plane) if plane else widest(self.positions)
+        extent = np.ptp(self.positions, axis=0) if len(self) else np.array([1.0, 0.0, 1.0])
+        across, up = map("xyz".index, plane) if plane else sorted(np.argsort(-extent, kind="stable")[:2])
         axis.plot(self.positions[:, across], self.positions[:, up], **options)
         if "label" in options:
             axis.legend()

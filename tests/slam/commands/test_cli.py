@@ -56,7 +56,6 @@ def test_a_recording_is_no_place_for_a_run_and_no_trial_is_no_comparison(slam_co
     [
         (["--backend", "foo"], ["foo", "ekf", "smoother"]),
         (["--set", "backend.colour=1"], ["colour"]),
-        (["--kind", "flying"], ["flying", "handheld"]),
         (["--frames", "40"], ["A:B; 0:40 are the first 40"]),
         (["--frames", "7:9"], ["7:9"]),
     ],

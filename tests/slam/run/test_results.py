@@ -19,7 +19,6 @@ TEN, ONE, START, HUNDRED = "ratio_10m", "ratio_1m", "ratio_start", "ratio_100m"
         ({START: 1.0}, 1, "hold: from the start errors of the pose are as large as they claim (0.45 to 1.55 in 95 %"),
         ({START: 1.265}, 12, "are too small: from the start errors of the pose are 1.26 times what they claim (0.84"),
         ({START: 0.316}, 1, "are too large: from the start errors of the pose are 0.316 times"),
-        ({TEN: 1.1, START: 0.95}, 1, "hold: over 10 m errors of the pose are 1.1 times"),
         ({TEN: 1.1, START: 6.3}, 1, "hold in part: over 10 m errors of the pose are 1.1 times"),
         (
             {START: 0.949, "pixels_alone": 1.0},
@@ -68,10 +67,9 @@ def test_doubtful_truth_is_named_and_not_the_covariance():
     assert verdict_of_run(tree).startswith("covariances cannot be judged: the true path is doubtful")
 
 
-@pytest.mark.parametrize("nees", [None, float("nan")])
-def test_covariances_that_cannot_be_judged_say_so(nees):
+def test_covariances_that_cannot_be_judged_say_so():
     """A back end that claims the same covariance in every frame had no verdict, and no word why."""
-    tree = summary(1.0) | {"consistency": {"mean NEES": nees, "dof": 6.0, "no covariance over 1 m": 1.0}}
+    tree = summary(1.0) | {"consistency": {"mean NEES": float("nan"), "dof": 6.0, "no covariance over 1 m": 1.0}}
     assert "cannot be judged" in verdict_of_run(tree) and "claims the same one for every frame" in verdict_of_run(tree)
     singular = tree | {"consistency": tree["consistency"] | {"singular covariances": 4}}
     assert verdict_of_run(singular).endswith("they are singular")
