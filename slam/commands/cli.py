@@ -40,22 +40,16 @@ _Text: TypeAlias = str | None
 
 #: Options that several commands share.
 _Out = Annotated[Path, option("Folder for the files.", "DIR", "--out", "-o")]
-_RunOut = Annotated[
-    Path | None, option("Folder for the files; default: results/SEQUENCE-BACKEND-N.", "DIR", "--out", "-o")
-]
+_RunOut = Annotated[_File, option("Folder; default: results/SEQUENCE-BACKEND-N.", "DIR", "--out", "-o")]
 _Overwrite = Annotated[bool, option("Replace files that are there; never an input.", None, "--overwrite")]
-_Set = Annotated[
-    list[str] | None,
-    option("A setting, e.g. map.max_landmarks=300; once per setting; see `slam settings`.", "KEY=VALUE", "--set"),
-]
+_Texts: TypeAlias = list[str] | None
+_Set = Annotated[_Texts, option("A setting, e.g. map.max_landmarks=300; see `slam settings`.", "KEY=VALUE", "--set")]
 _Backend = Annotated[str | None, option("Back end, see `slam list`; default: ekf.", "NAME")]
 _Frames = Annotated[str | None, option("Range of frames, B left out.", "A:B")]
 _Quiet = Annotated[bool, option("No progress, no table.", None, "--quiet", "-q")]
 _Picture = Annotated[bool, option("Leave a picture of the run.", None, "--picture/--no-picture")]
 _Format = Annotated[str | None, option("Format, or module:function; default: found out from the folder.", "FORMAT")]
-_Mask = Annotated[
-    str | None, option("Image that is black where a camera sees its own car; left, right.", "FILE[,FILE]")
-]
+_Mask = Annotated[_Text, option("Image that is black where a camera sees its own car; left, right.", "FILE[,FILE]")]
 
 
 def main() -> None:

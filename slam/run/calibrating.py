@@ -14,7 +14,7 @@ from slam.calibration.saved import CERTAIN, agreement, agreement_in_words, joint
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import CalibrationError, ConfigurationError
-from slam.geometry.rig_numbers import rig_difference, rig_numbers
+from slam.geometry.rig import rig_difference, rig_numbers
 from slam.geometry.se3 import Array
 from slam.outputs import Output, require_outputs
 from slam.run.outputs import write_json
