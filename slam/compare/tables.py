@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.compare.plan import REPLAY, Plan
+from slam.compare.plan import Plan
 from slam.compare.statistics import Difference, difference, mean_of, reach
 from slam.compare.sweep import Run
 from slam.files import read_object, write_text
@@ -232,10 +232,3 @@ def caution(plan: Plan, trials: int) -> str:
         return f"{trials} trials can hardly show any difference; take --trials {_FEW} or more."
     scatter = f"{least:.2g} times its scatter from trial to trial"
     return f"With {trials} trials only a difference of {scatter} can be told from chance."
-
-
-def measurements(mode: str, reference: str) -> str:
-    """Which measurements the back ends were given, for captions."""
-    if mode == REPLAY:
-        return f"Replay: all back ends are given the measurements of {reference}'s closed loop"
-    return "Closed loop: each back end's predictions choose its matches"

@@ -278,14 +278,12 @@ def oblong(*cameras: PinholeCamera) -> str:
             f"by the calibration the focal lengths along rows and columns differ by {100 * abs(share):.0f} %: pixels "
             "of digital cameras are square; is one mistyped, or were images scaled in one way?"
         )
-    first, off = cameras[0], np.array([_off_middle(camera) for camera in cameras])
-    for axis, (name, size) in enumerate((("width", first.width), ("height", first.height))):
-        one, other = off[:, axis], off[:, 1 - axis]
+    off = np.array([_off_middle(camera) for camera in cameras])
+    for name, one, other in (("width", off[:, 0], off[:, 1]), ("height", off[:, 1], off[:, 0])):
         if np.abs(one).min() > _OFF_ALIKE and np.ptp(one) < _OFF_ALIKE and np.abs(other).max() < _OFF_ALIKE / 2:
             return (
-                f"the principal points are in the middle of the images' {('height', 'width')[axis]}, and at "
-                f"{50 * (1 + one.mean()):.0f} % of their {name}: is the calibration for a {name} of about "
-                f"{size * (1 + one.mean()):.0f} px, and were these images of {size} px scaled or cut in that way alone?"
+                f"the principal points are at {50 * (1 + one.mean()):.0f} % of the images' {name}, and in the middle "
+                "the other way: were images scaled or cut in one way alone, and the calibration is for others?"
             )
     return ""
 

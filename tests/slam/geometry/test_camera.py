@@ -69,7 +69,7 @@ def test_a_principal_point_is_doubted_from_another_size_on_and_not_by_its_usual_
 
 @pytest.mark.parametrize(
     ("fv", "x", "y", "words"),
-    [(450, 1.0, 1.12, "a height of about"), (450, 1.12, 1.0, "a width of"), (410, 1.0, 1.0, "focal lengths along rows"),
+    [(450, 1.0, 1.12, "height"), (450, 1.12, 1.0, "width"), (410, 1.0, 1.0, "focal lengths along rows"),
      (450, 0.98, 0.924, ""), (450, 1.12, 1.12, "")],
 )  # fmt: skip
 def test_images_scaled_in_one_way_alone_are_asked_for(fv, x, y, words):
