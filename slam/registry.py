@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from slam.errors import ConfigurationError, SlamError, UnknownNameError, cause, text_of
-from slam.naming import unknown
+from slam.naming import suggestion, unknown
 
 #: What this distribution brings, so that a plain checkout works without being installed.
 BUILT_IN = {
@@ -90,7 +90,8 @@ def resolve(role: str, name: str) -> Any:
             raise UnknownNameError(f"{failed} {cause(error)}") from error
         raise UnknownNameError(f"{failed} {text_of(error)}{where}") from error
     except (ImportError, AttributeError, ValueError, TypeError, SyntaxError) as error:
-        raise UnknownNameError(f"{failed} {text_of(error)}") from error
+        near = suggestion(attribute, dir(sys.modules[module])) if module in sys.modules else ""
+        raise UnknownNameError(f"{failed} {text_of(error)}{near}") from error
     except (Exception, SystemExit) as error:  # whatever a foreign module does when it is imported
         raise UnknownNameError(f"{failed} {cause(error)}") from error
 

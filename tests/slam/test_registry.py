@@ -55,5 +55,7 @@ def test_a_back_end_by_its_module_in_the_working_folder(tmp_path, monkeypatch):
     for name in ("my_own_module:Other", "my_own_module:", ":Mine", "a_broken_module:Mine"):
         with pytest.raises(UnknownNameError, match=f"back end '{name}' cannot be loaded"):
             registry.resolve("backends", name)
+    with pytest.raises(UnknownNameError, match=r"no attribute 'mine' \(did you mean 'Mine'\?\)"):
+        registry.resolve("backends", "my_own_module:mine")
     with pytest.raises(UnknownNameError, match=f"looked for in {tmp_path}, where `slam` runs"):
         registry.resolve("backends", "no_module_of_this_name:Mine")
