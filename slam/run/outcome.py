@@ -13,6 +13,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, log
 from slam.input.warnings import REPEATED
 from slam.models import MotionModel
+from slam.run.options import RunOptions
 from slam.run.summary import RunRecord
 from slam.tracks.step import ENOUGH_FEATURES, HIDDEN
 
@@ -32,22 +33,14 @@ _MANY = 0.1  # guard: share of frames that were not tracked, from which on it is
 
 
 def outcome(
-    record: RunRecord,
-    rig: StereoRig,
-    warnings: Sequence[str] = (),
-    in_map: bool = False,
-    dropped: int = 0,
-    doubt: str = "",
-    driving: bool = False,
-    backend: str = "",
-    recorded: bool = False,
-) -> str:
+    record: RunRecord, rig: StereoRig, options: RunOptions, warnings: Sequence[str] = (), dropped: int = 0,
+    doubt: str = "", recorded: bool = False,
+) -> str:  # fmt: skip
     """What to say of a run in which many frames were not tracked, with the likely cause; empty for others.
 
-    The first frame is not counted: there is no map yet, unless the run began `in_map`. The first of the `warnings` is
+    The first frame is not counted: there is no map yet, unless the run began in one. The first of the `warnings` is
     taken for a cause; repeated images are counted instead. `dropped` frames of a live run came too late; `doubt`, of
-    `motion_doubt`, is a cause where nothing else is one. `backend` names one of somebody's own, which may be the cause.
-    What was `recorded` has no images.
+    `motion_doubt`, is a cause where nothing else is one. What was `recorded` has no images.
     """
     untracked = [row for row, status in enumerate(record.statuses) if row and status != _TRACKED]
     frames, missed = len(record.statuses) - 1, len(untracked)
@@ -56,11 +49,11 @@ def outcome(
     frozen = 2 * record.repeated > missed
     cause = next((line for line in warnings if REPEATED not in line), "")
     if not cause and not frozen:
-        cause = _starved(record, untracked, rig, in_map, recorded) or doubt
+        cause = _starved(record, untracked, rig, options.prior_map is not None, recorded) or doubt
         if not cause and dropped < frames:  # where most came, the gaps are hardly all of it
-            cause = _unexplained(record, rig, driving)
-            if backend:
-                cause = f"the back end {backend} (`python -m slam.testing {backend}` checks it); or {cause}"
+            cause = _unexplained(record, rig, options.kind == "driving")
+            if ":" in (name := options.backend):  # somebody's own
+                cause = f"the back end {name} (`python -m slam.testing {name}` checks it); or {cause}"
     causes = [cause] if cause else []
     if frozen:
         causes.append(f"in {record.repeated} of them {REPEATED}")

@@ -257,10 +257,8 @@ class _Run:
         warnings, driving = getattr(self.system, "warnings", ()), options.kind == "driving"
         no_path = scale_doubt(record, rig, driving)
         doubt = no_path or motion_doubt(record, options.config.models.motion, driving)
-        in_map, dropped = options.prior_map is not None, self.live.dropped if self.live else 0
-        own = options.backend if ":" in options.backend else ""
-        recorded = isinstance(self.sequence, Recording)
-        tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving, own, recorded)
+        dropped, recorded = self.live.dropped if self.live else 0, isinstance(self.sequence, Recording)
+        tracking = outcome(record, rig, options, warnings, dropped, doubt, recorded)
         if doubt and not tracking:
             logger.warning("%s", doubt)
         if isinstance(self.system, StereoSlam) and not self.system.doubt and self.system.calibration.warning:
