@@ -35,24 +35,15 @@ def record(tracked: int, frames: int = 21, features: tuple[int, int] = (200, 150
         ((200, 3), 0.12, {}, "in the median of these frames 3 of 200 features are found in the right image"),
         ((200, 150), 120.0, {}, "the cameras are 120 m apart"),
         ((200, 150), 0.12, {"dropped": 40}, "40 frames were dropped"),
-        (
-            (200, 150),
-            0.12,
-            {"dropped": 1, "options": replace(OPTIONS, backend="a:B")},
-            "the back end a:B (`python -m slam.testing a:B` checks",
-        ),
-        (
-            (200, 0),
-            0.12,
-            {"options": replace(OPTIONS, prior_map=Path("a"))},
-            "the camera is not where the map was made",
-        ),
+        ((200, 150), 0.12, {"backend": "a:B"}, "the back end a:B (`python -m slam.testing a:B` checks it)"),
+        ((200, 0), 0.12, {"prior_map": Path("a")}, "the camera is not where the map was made"),
         ((200, 3), 0.12, {"warnings": ["left and right look swapped", "more"]}, "left and right look swapped"),
     ],
 )
 def test_the_first_step_that_gave_too_little_is_the_cause(features, baseline, more, words):
     rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, baseline, 320, 240)
-    said = outcome(record(0, features=features), rig, **({"options": OPTIONS} | more))
+    options = replace(OPTIONS, **{name: more.pop(name) for name in ("backend", "prior_map") if name in more})
+    said = outcome(record(0, features=features), rig, options, **more)
     assert said.startswith(f"no frame after the first was tracked; likely cause: {words}")
 
 
