@@ -26,12 +26,7 @@ _TRIED = 15  # frames by which the time of a comparison is told
 
 
 def compare(
-    plan: Plan,
-    out: Path,
-    workers: int | None = None,
-    quiet: bool = False,
-    overwrite: bool = False,
-    command: str = "",
+    plan: Plan, out: Path, workers: int | None = None, quiet: bool = False, overwrite: bool = False, command: str = ""
 ) -> list[Run]:
     """Run a comparison to its end and leave ``report.html``, tables and figures in `out`.
 
@@ -63,7 +58,10 @@ def compare(
     limits = caution(plan, plan.trials if any(map(is_world, plan.sequences)) else 1)
     if not quiet:
         left = [trial for trial in plan.every if overwrite or not is_done(plan, trial, out)]
-        print(f"{_work(plan, left, frames, count)}\n{limits}", flush=True)
+        before = f", {len(plan.every) - len(left)} of them done before" if len(left) < len(plan.every) else ""
+        seconds = _seconds(left, frames) if left else None
+        about = "" if seconds is None else f": about {seconds / min(count, len(left)):.0f} s, by the first frames"
+        print(f"{len(plan.every)} runs{before}, {total} frames in all, {count} at a time{about}\n{limits}", flush=True)
     with counting(total, "frames", quiet) as tell:
 
         def ended(trial: Trial) -> None:
@@ -90,15 +88,6 @@ def _print_doubts(runs: Sequence[Run]) -> None:
             told.setdefault(f"{run.trial.sequence}: {text}", []).append(run)
     for text, own in list(told.items())[:_NAMED]:
         print(f"{text} ({', '.join(dict.fromkeys(run.trial.backend for run in own))}, {count_of(len(own), 'run')})")
-
-
-def _work(plan: Plan, left: Sequence[Trial], frames: Mapping[str, int], count: int) -> str:
-    """How much is to be run, `count` runs at a time, and how long what is `left` takes."""
-    before = f", {len(plan.every) - len(left)} of them done before" if len(left) < len(plan.every) else ""
-    seconds = _seconds(left, frames) if left else None
-    about = "" if seconds is None else f": about {seconds / min(count, len(left)):.0f} s, by the first frames"
-    total = sum(frames[trial.sequence] for trial in plan.every)
-    return f"{len(plan.every)} runs{before}, {total} frames in all, {count} at a time{about}"
 
 
 def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:

@@ -10,7 +10,6 @@ from slam.commands.display import print_summary, progress
 from slam.commands.run import require_no_recording
 from slam.config import SystemConfig
 from slam.data import FrameResult
-from slam.errors import ConfigurationError
 from slam.files import write_png
 from slam.outputs import Output, require_outputs
 from slam.registry import ONLINE
@@ -30,7 +29,6 @@ _WHY = "Errors / claimed σ: at 2 they are twice as large as claimed."
 
 _FRAME = "frame.png"
 _SECONDS = 0.07  # of a frame, about
-_LEAST = 10  # frames
 
 
 def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -> list[dict[str, Any]]:
@@ -40,8 +38,6 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     frame in which the box was measured). Raises SlamError where a file cannot be written, or is
     there already and may not be replaced.
     """
-    if frames < _LEAST:
-        raise ConfigurationError(f"slam demo: frames must be {_LEAST} or more, got {frames}")
     require_no_recording(out)
     own = Output(out, "--out", [PICTURE, _FRAME])
     require_outputs([own, *(Output(out / backend, "--out", NAMES) for backend in ONLINE)], (), overwrite)

@@ -98,10 +98,7 @@ def calibrate(
 
 
 def _run(
-    sequence: StereoSequence,
-    config: SystemConfig,
-    frames: tuple[int, int | None],
-    on_frame: OnFrame,
+    sequence: StereoSequence, config: SystemConfig, frames: tuple[int, int | None], on_frame: OnFrame
 ) -> tuple[dict[str, Any], RigEvidence | None]:
     """What one recording says alone, and its evidence without any prior; None where no motion was seen."""
     system = StereoSlam(sequence.rig, _FRONTEND, _BACKEND, config=config)

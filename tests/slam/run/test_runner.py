@@ -99,10 +99,7 @@ def test_a_fault_half_way_keeps_what_was_done(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-@pytest.mark.parametrize(
-    ("kill", "ignored"),
-    [(signal.SIGINT, False), (signal.SIGKILL, False), (signal.SIGHUP, True)],
-)
+@pytest.mark.parametrize(("kill", "ignored"), [(signal.SIGINT, False), (signal.SIGKILL, False), (signal.SIGHUP, True)])
 def test_a_stopped_run_keeps_its_frames(tmp_path, kill, ignored):
     """And where the signal is to be ignored, as `nohup` has it, the run goes on."""
     frames = 12 if ignored else 2000
