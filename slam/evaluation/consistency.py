@@ -58,19 +58,15 @@ def consistency_figures(
 
     Returns:
         "mean NEES" from the start, "NEES over L m" for each of `STRETCHES`; six is right for all of these, and "band
-        low" and "band high" hold 95 % of runs; the same with ", truth exact", as if a truth with errors had none;
-        "doubtful truth over L m" and "no covariance over L m", the shares of stretches left out because the truth
-        contradicts itself or an old place was measured again within them, where there are any.
+        low" and "band high" hold 95 % of runs; "doubtful truth over L m" and "no covariance over L m", the shares of
+        stretches left out because the truth contradicts itself or an old place was measured again within them, where
+        there are any.
     """
     start = int(np.argmin(interpolated(true, noise)))  # the first pose that was measured
     later = np.arange(start + 1, len(own))
     from_start = stretch_nees(own, true, covariances, noise, np.full(len(later), start), later, common, joint)
     low, high = chi_square_band(_DOF)  # of one value: errors of the rig make all frames of a run as good as one
     figures = {"mean NEES": _mean(from_start), "band low": low, "band high": high, "dof": float(_DOF)}
-    exact, noisy = TruthNoise(), noise != TruthNoise()
-    if noisy:
-        of_exact = stretch_nees(own, true, covariances, exact, np.full(len(later), start), later, common, joint)
-        figures["mean NEES, truth exact"] = _mean(of_exact[np.isfinite(from_start)])
     closed = _closings(covariances)
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(true.positions, axis=0), axis=1).cumsum()])
     for length in STRETCHES:
@@ -80,9 +76,6 @@ def consistency_figures(
         values[closed[starts] != closed[last[starts]]] = np.nan
         if np.isfinite(values).any():
             figures[f"NEES over {length:g} m"] = _mean(values)
-            if noisy:
-                of_exact = stretch_nees(own, true, covariances, exact, starts, last[starts], common, joint)
-                figures[f"NEES over {length:g} m, truth exact"] = _mean(of_exact[np.isfinite(values)])
         left_out = doubtful(true, noise, starts, last[starts])
         none = ~np.isfinite(values) & ~left_out
         for what, rows in (("doubtful truth", left_out), ("no covariance", none)):

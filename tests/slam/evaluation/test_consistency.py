@@ -46,7 +46,7 @@ def test_relative_nees_of_honest_odometry_is_six():
         assert 5.0 < figures[key] < 7.0, key
     assert "NEES over 100 m" not in figures
     band = f"{np.sqrt(figures['band low'] / 6):.2f} to {np.sqrt(figures['band high'] / 6):.2f}"
-    assert band in verdict({"nees_per_dof": 1.0})  # one band in a summary and in what is said of it
+    assert band in verdict({"ratio_start": 1.0})  # one band in a summary and in what is said of it
 
 
 def test_relative_nees_tells_covariances_that_are_too_small():
