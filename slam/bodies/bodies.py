@@ -66,6 +66,11 @@ class Body:
         return self.certain >= PROOF and self.agreeing >= SOLID * (self.agreeing + self.against)
 
     @property
+    def gone(self) -> bool:
+        """Whether it is out of view, and nothing is known of its place any more."""
+        return self.belief is None and self.missed > 1
+
+    @property
     def solid(self) -> float:
         """Twice the log odds, no more than is clear, that what is inside goes with it, by those that clearly did."""
         return min(2.0 * math.log((self.agreeing + 1.0) / (self.against + 1.0)), CLEAR)
@@ -138,6 +143,13 @@ def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_spe
         velocity_covariance=P, belief=belief,
         moving=body.seen <= MIN_FRAMES or (certain and speed > min_speed), **changes,
     )  # fmt: skip
+
+
+def returned(body: Body, T: Array, slot: int, stamp: float) -> Body:
+    """A body that is seen again, at a pose (4, 4); its estimate begins anew."""
+    return body.placed(
+        T, slot, True, T_before=T, covariance=_SPREAD**2 * np.eye(6), seen_at=stamp, seen=body.seen + 1, missed=0
+    )
 
 
 def continued(body: Body, known: Body) -> Body:
