@@ -66,9 +66,17 @@ class Body:
         return self.certain >= PROOF and self.agreeing >= SOLID * (self.agreeing + self.against)
 
     @property
+    def unplaced(self) -> bool:
+        """Whether it may be farther from where it is expected, seen from the camera, than it is wide."""
+        if self.belief is None:
+            return True
+        since = np.trace((self.covariance - self.belief.estimate.covariance)[3:, 3:])
+        return bool(self.belief.spread**2 + since > self.across**2)
+
+    @property
     def gone(self) -> bool:
-        """Whether it is out of view, and nothing is known of its place any more."""
-        return self.belief is None and self.missed > 1
+        """Whether it is out of view, and may be anywhere."""
+        return self.missed > 1 and self.unplaced
 
     @property
     def solid(self) -> float:
@@ -148,8 +156,9 @@ def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_spe
 def returned(body: Body, T: Array, slot: int, stamp: float) -> Body:
     """A body that is seen again, at a pose (4, 4); its estimate begins anew."""
     return body.placed(
-        T, slot, True, T_before=T, covariance=_SPREAD**2 * np.eye(6), seen_at=stamp, seen=body.seen + 1, missed=0
-    )
+        T, slot, True, T_before=T, covariance=_SPREAD**2 * np.eye(6), seen_at=stamp, seen=body.seen + 1, missed=0,
+        belief=None,
+    )  # fmt: skip
 
 
 def continued(body: Body, known: Body) -> Body:

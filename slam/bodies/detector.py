@@ -192,17 +192,17 @@ class MovingObjectDetector(ObjectDetector):
 
     def _estimated(self, body: Body, tracks: Tracks, frame: Frame) -> Body:
         """The body after this frame."""
-        stamp = frame.features.stamp
-        if body.gone:
-            T = found_again(body, tracks, frame)
-            return body if T is None else returned(body, T, frame.slot, stamp)
+        slot, stamp = frame.slot, frame.features.stamp
+        T = found_again(body, tracks, frame) if body.gone else None
+        if T is not None:
+            return returned(body, T, slot, stamp)
         mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
         front = (b for b in self.bodies.values() if b.proven and not b.gone and b.id != body.id)
         tracks.row[mine[hidden(front, frame.eye, tracks.position[mine])]] = -1
         belief = located(body, tracks, frame, self._estimator)
-        if belief is None or (not belief.estimate.measured and belief.spread > body.across):
+        if belief is None or not self.setup.models.known(belief.estimate):  # it begins anew once measured again
             return replace(body, belief=None)
-        return with_belief(body, belief, frame.slot, stamp, self.setup.config.min_speed)
+        return with_belief(body, belief, slot, stamp, self.setup.config.min_speed)
 
     def _record(self, tracks: Tracks, rows: IndexArray, frame: Frame) -> None:
         """Add what tracks (K,) measured in this frame."""

@@ -9,7 +9,7 @@ from scipy.spatial.distance import cdist
 
 from slam.bodies.belief import BodyBelief
 from slam.bodies.bodies import Body, of_bodies
-from slam.bodies.config import MIN_FRAMES
+from slam.bodies.config import MIN_FRAMES, MIN_POINTS
 from slam.bodies.estimator import BodyEstimator
 from slam.bodies.frame import Frame
 from slam.bodies.track_kernels import inverses
@@ -117,7 +117,8 @@ def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) 
     misfits, but followed on: they may lie on a part that moves otherwise, such as a lid.
     """
     mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
-    belief = estimator.updated(body.belief, body.id, observed(body, tracks, mine, frame.features), frame.cameras)
+    some = mine[:0] if len(mine) < MIN_POINTS and body.unplaced else mine  # any two points agree with one of its poses
+    belief = estimator.updated(body.belief, body.id, observed(body, tracks, some, frame.features), frame.cameras)
     rows = tracks.row[mine]
     tracks.row[mine] = -1
     if belief is None or not belief.estimate.measured:
