@@ -48,7 +48,7 @@ class Body:
     measured: bool = True  # whether it was in this frame
     moving: bool = True  # whether it moves now
     evidence: float = 0.0  # evidence that it has moved, given all that is uncertain; see `slam.bodies.proof`
-    far: bool = False  # whether it was followed for farther than it is wide before it became a body
+    far: bool = False  # whether it was followed for farther than it is wide
     certain: int = 0  # what frames so far count for the proof that it moves, see `slam.bodies.proof`
     agreeing: int = 0  # number of members, added over frames, that went with it rather than stood still
     against: int = 0  # number of others inside its extent, added over frames, that rather stood still
@@ -87,6 +87,11 @@ class Body:
     def across(self) -> float:
         """Diagonal of its extent, but no less than its least size [m]."""
         return max(math.dist(self.upper, self.lower), self.size)
+
+    @property
+    def went(self) -> float:
+        """How far it is from where its estimate began [m]."""
+        return 0.0 if self.belief is None else math.dist(self.T[:3, 3], self.belief.T_begun[:3, 3])
 
     @property
     def middle(self) -> Array:

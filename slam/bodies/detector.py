@@ -261,8 +261,9 @@ class MovingObjectDetector(ObjectDetector):
             members = members[tracks.count(members) >= MIN_FRAMES - 1]
             scene = scenes[None if whole is None else whole.id]
             moved, way = finder.moved_in(whole, tracks, members, frame), Way.of(body, frame, whole)
-            evidence, counts = with_frame(body.evidence, moved, scene, way, body.far, both)
-            body = replace(body, evidence=evidence, certain=body.certain + counts)
+            far = body.far or (self.setup.config.size > 0 and body.went > body.across)
+            evidence, counts = with_frame(body.evidence, moved, scene, way, far, both)
+            body = replace(body, evidence=evidence, certain=body.certain + counts, far=far)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= 2 * WINDOW:  # the first holds how it started
                 self._drop(tracks, body)
