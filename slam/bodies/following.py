@@ -39,7 +39,8 @@ def follow(tracks: Tracks, bodies: Mapping[int, Body], frame: Frame) -> None:
     Tracks are looked for where their fit, or their body's motion, says, in windows as wide as that is uncertain; then
     those too young to have a velocity as far off as `max_speed` allows. Members of a body that was not measured in the
     last frame keep their descriptors, which would else become those of what occludes the body, and leave the features
-    that they match to free tracks: they may newly come into view.
+    that they match to free tracks: they may newly come into view. Those of a body that is gone are not looked for here,
+    see `found_again`.
     """
     alive = np.flatnonzero(tracks.number >= 0)
     _advance(tracks, bodies, alive, frame.dt)
