@@ -201,8 +201,6 @@ class MovingObjectDetector(ObjectDetector):
         front = (b for b in self.bodies.values() if b.proven and not b.gone and b.id != body.id)
         tracks.row[mine[hidden(front, frame.eye, tracks.position[mine])]] = -1
         belief = located(body, tracks, frame, self._estimator)
-        if belief is None or not self.setup.models.known(belief.estimate):  # it begins anew once measured again
-            return replace(body, belief=None)
         return with_belief(body, belief, slot, stamp, self.setup.config.min_speed)
 
     def _record(self, tracks: Tracks, rows: IndexArray, frame: Frame) -> None:
