@@ -131,7 +131,7 @@ class Graph:
             self._taken = len(s.sights[s.of(number)])
         kept = self._tracks.keep(problem, s)
         made = self._tracks.make_smart(problem, s.number < self._careful)
-        # Two steps of Gauss and Newton: in the first no time passes, so that nothing leaves. What leaves fixes where its
+        # Two steps of Gauss and Newton: in the first no time passes, so nothing leaves. What leaves fixes where its
         # neighbours stay linearised, and that is to be after the newest pose is solved for.
         now: Stamps = dict.fromkeys(problem.values.keys(), float(s.ages[s.of(numbers.start)] - 1))
         with solving():
