@@ -111,7 +111,7 @@ class EulerCamera:
         for piece in range(pieces):
             phi_y, rate = camera.x[[4, 10]]
             if max(abs(phi_y), abs(phi_y + rate * dt / pieces)) > LIMIT:
-                camera, G = camera.reanchored()
+                camera, G = camera.reanchored(camera.pose)
                 J = G @ J
                 W = G @ W if piece else W
             camera, A = camera._transition(dt / pieces)
@@ -150,17 +150,17 @@ class EulerCamera:
         """See `Camera`."""
         return self.reanchored(T) if abs(math.sin(self.at(T).x[4])) > math.sin(LIMIT) else (self, np.eye(CAMERA))
 
-    def reanchored(self, T: Array | None = None) -> tuple[EulerCamera, Array]:
+    def reanchored(self, T: Array) -> tuple[EulerCamera, Array]:
         """In a new angles' world, chosen for its attitude; and the Jacobian (12, 12) of its numbers by the old.
 
-        Its y is the camera's right, its z the camera's down; or, with a pose T (4, 4), across the right of both: φy is
-        zero there, too.
+        Its y is the camera's right, its z across the right of both this and a pose T (4, 4): φy is zero there, too; or,
+        where both look alike, the camera's down.
         """
         phi, omega, J, x = self.x[3:6], self.x[9:12], np.eye(CAMERA), self.x.copy()
         R = self.pose[:3, :3]
-        down = R[:, 1] if T is None else np.cross(R[:, 0], T[:3, 0])
-        size = np.linalg.norm(down)
-        down = down / size if size > _ACROSS else R[:, 1]
+        across = np.cross(R[:, 0], T[:3, 0])
+        size = np.linalg.norm(across)
+        down = across / size if size > _ACROSS else R[:, 1]
         world = np.stack([np.cross(R[:, 0], down), R[:, 0], down], axis=1)
         new = angles(world.T @ R)
         inverse = np.linalg.inv(body_rate_matrix(new))  # the angles' world is made so that this is orthonormal
