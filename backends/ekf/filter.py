@@ -256,7 +256,8 @@ class LandmarkFilter:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self.name}: {error}")
         used, w = found.used, found.w
         dof, ids = int(np.isfinite(z[used]).sum()), observations.ids
-        return after, UpdateReport(UpdateStatus.OK, "", ids[used], ids[~used], float(w @ w), dof)
+        reason = "" if found.linear else f"{self.name}: not linear after {self._iterations} iterations"
+        return after, UpdateReport(UpdateStatus.OK, reason, ids[used], ids[~used], float(w @ w), dof)
 
     def _started(self, what: str) -> FilterState:
         if self.state.frame < 0:

@@ -181,6 +181,7 @@ class Solution:
     used: BoolArray  # which landmarks (M,)
     rows: IndexArray  # their rows (3K,) of the innovation
     L_inverse: Array  # (3K, 3K), lower triangular
+    linear: bool = True  # whether the measurements are so at the solution; not looked at where one linearisation is all
 
     @cached_property
     def w(self) -> Array:

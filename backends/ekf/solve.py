@@ -7,7 +7,7 @@ by ``P Hᵀ y``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -135,9 +135,9 @@ def _iterate(at: Linearisation, used: BoolArray) -> Solution:
         if not np.isfinite(found.change).all() or np.abs((found.change - at.change)[3:6]).max() > np.pi:
             raise LinAlgError("a step is not finite, or turns the camera by more than half a turn")
         if update.iterations == 1 or _linear(found):
-            break
+            return found
     assert found is not None  # there is one iteration at least
-    return found
+    return replace(found, linear=False)
 
 
 def _linear(found: Solution) -> bool:

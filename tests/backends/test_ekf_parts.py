@@ -323,7 +323,7 @@ def test_the_iterated_update_is_the_maximum_of_the_posterior(spread, monkeypatch
     s, update = far_off(50, spread)
     deviation = np.sqrt(np.diag(dense(s.covariance)))
     solution = ungated(update)
-    assert solution.used.all()
+    assert solution.used.all() and solution.linear and not ungated(replace(update, iterations=2)).linear
     cost = lambda x: residuals(s, update, deviation * x)  # noqa: E731
     best = least_squares(cost, np.zeros(48), xtol=1e-12, ftol=1e-12, gtol=1e-12)
     np.testing.assert_allclose(corrected(s, update), deviation * best.x, atol=1e-5)
