@@ -203,37 +203,29 @@ def _collect(space, pixels, stride, filters, layer, row, out, found):
     return found
 
 
-def _column_phases(integral: NDArray[np.int32], step: int, first: int, last: int) -> NDArray[np.int32]:
+@helper
+def _column_phases(integral, step, first, last, out):
     """Columns of an integral image by their remainder, ``out[p, y, j] = integral[y, step * j + p]``, of some rows.
 
     A filter that moves in steps of `step` then reads neighbouring memory.
     """
-    rows, columns = integral.shape
-    if step == 1:
-        return integral[None]
-    out = np.empty((step, rows, -(-columns // step)), np.int32)
     for p in range(step):
-        phase = integral[first:last, p::step]
-        out[p, first:last, : phase.shape[1]] = phase
-    return out
-
-
-def detect_octave(
-    integral: NDArray[np.int32], filters: Filters, octave: int, threshold: float, first_row: int, last_row: int
-) -> NDArray[np.float64]:
-    """Candidates (N, COLUMNS) above a threshold in an octave, from a grid row to before another, in raster order."""
-    top, bottom = first_row - 1 - filters.centre[-2], last_row + 1 + filters.centre[-2]  # that inner layers read
-    phases = _column_phases(integral, filters.step, max(top, 0) * filters.step, (bottom + 1) * filters.step)
-    found = _scan(integral, phases, filters, np.float32(threshold), first_row, last_row)
-    found[:, 5] = octave
-    return found
+        for y in range(first, last):
+            for j in range((integral.shape[1] - p + step - 1) // step):
+                out[p, y, j] = integral[y, step * j + p]
 
 
 @kernel
-def _scan(integral, phases, filters, threshold, first_row, last_row):
-    """The search itself; the octave is not filled in."""
+def detect_octave(integral, filters, octave, threshold, first_row, last_row):
+    """Candidates (N, COLUMNS) above a threshold in an octave, from a grid row to before another, in raster order."""
     step, height, width, stride = filters.step, integral.shape[0] - 1, integral.shape[1] - 1, integral.shape[1]
     rows, columns, inner = height // step, width // step, len(filters.sizes) - 2
+    phases = integral.reshape(1, height + 1, stride)
+    if step > 1:
+        phases = np.empty((step, height + 1, -(-stride // step)), np.int32)
+        margin = filters.centre[inner] + 1  # rows above and below that inner layers read
+        first, last = max(first_row - margin, 0) * step, min((last_row + margin + 1) * step, height + 1)
+        _column_phases(integral, step, first, last, phases)
     ring = np.zeros((inner, 3, columns + 1), np.float32)  # three rows of each layer; row i lies in slot i % 3
     words = np.zeros((columns + 7) // 8, np.uint64)
     buffer, responses, mask = np.empty(3 * step * phases.shape[2], np.int32), ring.reshape(-1), words.view(np.uint8)
@@ -268,4 +260,6 @@ def _scan(integral, phases, filters, threshold, first_row, last_row):
                 rival, threshold, mask[a:b],
             )  # fmt: skip
             found = _collect(space, pixels, stride, filters, layer, row, out, found)
+    for k in range(found):  # a slice would take longer to compile
+        out[k, 5] = octave
     return out[:found].copy()
