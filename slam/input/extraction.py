@@ -38,7 +38,8 @@ def checksum_of(frame: StereoFrame) -> tuple[int, int] | None:
     Images of a camera that stands still differ by their noise.
     """
     left, right = (
-        crc32(np.ascontiguousarray(image)) if shows_something(image) else None for image in (frame.left, frame.right)
+        crc32(np.ascontiguousarray(image).data) if shows_something(image) else None
+        for image in (frame.left, frame.right)
     )
     return None if left is None else (left, right or 0)
 
