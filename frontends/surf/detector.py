@@ -204,15 +204,16 @@ def _collect(space, pixels, stride, filters, layer, row, out, found):
 
 
 @helper
-def _column_phases(integral, step, first, last, out):
-    """Columns of an integral image by their remainder, ``out[p, y, j] = integral[y, step * j + p]``, of some rows.
+def _column_phases(pixels, stride, shape, first, last, out):
+    """Columns of a flat integral image by their remainder, ``out[p, y, j] = integral[y, step * j + p]``, of some rows.
 
-    A filter that moves in steps of `step` then reads neighbouring memory.
+    A filter that moves in steps of `step` then reads neighbouring memory. `out`, flat too, is of shape (step, rows, n).
     """
+    step, rows, n = shape
     for p in range(step):
         for y in range(first, last):
-            for j in range((integral.shape[1] - p + step - 1) // step):
-                out[p, y, j] = integral[y, step * j + p]
+            for j in range((stride - p + step - 1) // step):
+                out[np.uint64((p * rows + y) * n + j)] = pixels[np.uint64(y * stride + step * j + p)]
 
 
 @kernel
@@ -220,20 +221,20 @@ def detect_octave(integral, filters, octave, threshold, first_row, last_row):
     """Candidates (N, COLUMNS) above a threshold in an octave, from a grid row to before another, in raster order."""
     step, height, width, stride = filters.step, integral.shape[0] - 1, integral.shape[1] - 1, integral.shape[1]
     rows, columns, inner = height // step, width // step, len(filters.sizes) - 2
-    phases = integral.reshape(1, height + 1, stride)
+    pixels = phases = integral.reshape(-1)
+    shape = step, height + 1, -(-stride // step)
     if step > 1:
-        phases = np.empty((step, height + 1, -(-stride // step)), np.int32)
-        margin = filters.centre[inner] + 1  # rows above and below that inner layers read
-        first, last = max(first_row - margin, 0) * step, min((last_row + margin + 1) * step, height + 1)
-        _column_phases(integral, step, first, last, phases)
+        phases = np.empty(shape[0] * shape[1] * shape[2], np.int32)
+        reach = filters.centre[inner] + 1  # rows above and below that inner layers read
+        first, last = max(first_row - reach, 0) * step, min((last_row + reach + 1) * step, height + 1)
+        _column_phases(pixels, stride, shape, first, last, phases)
     ring = np.zeros((inner, 3, columns + 1), np.float32)  # three rows of each layer; row i lies in slot i % 3
     words = np.zeros((columns + 7) // 8, np.uint64)
-    buffer, responses, mask = np.empty(3 * step * phases.shape[2], np.int32), ring.reshape(-1), words.view(np.uint8)
+    buffer, responses, mask = np.empty(3 * step * shape[2], np.int32), ring.reshape(-1), words.view(np.uint8)
     slots = np.empty(3, np.int64)
     space = buffer, ring, responses, words, mask, slots, np.empty((3, 3, 3)), np.empty((3, 3)), np.empty(3)
     # At most one strict maximum in each 2x2 block of a layer.
     out = np.empty((max(16, (last_row - first_row + 2) * (columns + 1) // 4 * inner), COLUMNS))
-    pixels, phases_shape, phases = integral.reshape(-1), phases.shape, phases.reshape(-1)
     found = np.int64(0)
     for i in range(max(0, first_row - 1), min(rows, last_row + 1)):
         for layer in range(1, inner + 1):
@@ -242,7 +243,7 @@ def detect_octave(integral, filters, octave, threshold, first_row, last_row):
                 to = np.uint64((3 * (layer - 1) + i % 3) * ring.shape[2] + start)
                 count = 1 + (width - size) // step
                 y0 = step * (i - start)
-                _response_row(phases, phases_shape, filters, layer, y0, buffer, count, responses, to)
+                _response_row(phases, shape, filters, layer, y0, buffer, count, responses, to)
         row = i - 1
         slots[0], slots[1], slots[2] = (row - 1) % 3, row % 3, i % 3
         for layer in range(1, inner + 1):

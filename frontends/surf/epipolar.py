@@ -38,20 +38,44 @@ class HalfImage(NamedTuple):
 
 
 @vector_helper
-def _halve(grey, scale, y, pixels, half, between):
+def _halve(grey, scale, y, columns, pixels, half, between):
     """Two rows of an image as float32 pixels and, brought to 0..255, as row y at half resolution."""
+    to, last, quarter = np.uint64(y * columns), grey.shape[1] - 1, np.float32(0.25) * scale
     for x in range(grey.shape[1]):
         pixels[2 * y, x], pixels[2 * y + 1, x] = np.float32(grey[2 * y, x]), np.float32(grey[2 * y + 1, x])
-    quarter, last = np.float32(0.25) * scale, half.shape[1] - 1
-    for x in range(half.shape[1]):
-        half[y, x] = quarter * (
-            pixels[2 * y, 2 * x] + pixels[2 * y, 2 * x + 1] + pixels[2 * y + 1, 2 * x] + pixels[2 * y + 1, 2 * x + 1]
-        )
-    for x in range(last + 1):
-        right = min(2 * x + 2, grey.shape[1] - 1)
-        between[y, x] = quarter * (
-            pixels[2 * y, 2 * x + 1] + pixels[2 * y, right] + pixels[2 * y + 1, 2 * x + 1] + pixels[2 * y + 1, right]
-        )
+    for x in range(columns):
+        a, b = pixels[2 * y, 2 * x] + pixels[2 * y, 2 * x + 1], pixels[2 * y + 1, 2 * x] + pixels[2 * y + 1, 2 * x + 1]
+        half[to + np.uint64(x)] = quarter * (a + b)
+    for x in range(columns):
+        k, right = 2 * x + 1, min(2 * x + 2, last)
+        a, b = pixels[2 * y, k] + pixels[2 * y, right], pixels[2 * y + 1, k] + pixels[2 * y + 1, right]
+        between[to + np.uint64(x)] = quarter * (a + b)
+
+
+@vector_helper
+def _column_sums(pixels, y, columns, sums, squares):
+    """Sums of pixels and of their squares over the patch rows about row y, less a middle grey to keep digits."""
+    grey = np.float32(128.0)
+    for x in range(columns):
+        s, q = np.float32(0.0), np.float32(0.0)
+        for r in range(_SIDE):
+            v = pixels[np.uint64((y - _HALF + r) * columns) + np.uint64(x)] - grey
+            s += v
+            q += v * v
+        sums[x], squares[x] = s, q
+
+
+@vector_helper
+def _row_weights(sums, squares, y, columns, weight):
+    area, zero = np.float32(_SIDE * _SIDE), np.float32(0.0)
+    least, to = np.float32(_FLAT * _FLAT) * area, np.uint64(y * columns + _HALF)
+    for x in range(columns - 2 * _HALF):
+        s, q = zero, zero
+        for c in range(_SIDE):
+            s += sums[x + c]
+            q += squares[x + c]
+        spread = q - s * s / area
+        weight[to + np.uint64(x)] = np.float32(1.0) / np.sqrt(spread) if spread > least else zero
 
 
 @kernel
@@ -60,46 +84,19 @@ def float_images(grey, scale):
 
     An odd last row or column is left out there.
     """
-    pixels, (rows, columns) = np.empty(grey.shape, np.float32), (grey.shape[0] // 2, grey.shape[1] // 2)
-    flat, sums = np.zeros((3, rows * columns + _LANES), np.float32), np.empty((2, columns), np.float32)
-    half, weight, between = (
-        flat[0, : rows * columns].reshape(rows, columns), flat[1, : rows * columns].reshape(rows, columns),
-        flat[2, : rows * columns].reshape(rows, columns),
-    )  # fmt: skip
+    rows, columns = grey.shape[0] // 2, grey.shape[1] // 2
+    pixels, size = np.empty(grey.shape, np.float32), rows * columns + _LANES
+    half, weight, between = np.zeros(size, np.float32), np.zeros(size, np.float32), np.zeros(size, np.float32)
+    sums, squares = np.empty(columns, np.float32), np.empty(columns, np.float32)
     for y in range(rows):
-        _halve(grey, scale, y, pixels, half, between)
-    for x in range(grey.shape[1] if grey.shape[0] % 2 else 0):
-        pixels[grey.shape[0] - 1, x] = np.float32(grey[grey.shape[0] - 1, x])
+        _halve(grey, scale, y, columns, pixels, half, between)
+    for y in range(2 * rows, grey.shape[0]):
+        for x in range(grey.shape[1]):
+            pixels[y, x] = np.float32(grey[y, x])
     for y in range(_HALF, rows - _HALF):
-        _column_sums(half, y, sums)
-        _row_weights(sums, weight, y)
-    return pixels, (rows, columns), flat[0], flat[1], flat[2]
-
-
-@vector_helper
-def _column_sums(pixels, y, sums):
-    """Sums of pixels and of their squares over the patch rows about row y, less a middle grey to keep digits."""
-    grey = np.float32(128.0)
-    for x in range(sums.shape[1]):
-        s, q = np.float32(0.0), np.float32(0.0)
-        for r in range(_SIDE):
-            v = pixels[y - _HALF + r, x] - grey
-            s += v
-            q += v * v
-        sums[0, x], sums[1, x] = s, q
-
-
-@vector_helper
-def _row_weights(sums, weight, y):
-    area, zero = np.float32(_SIDE * _SIDE), np.float32(0.0)
-    least = np.float32(_FLAT * _FLAT) * area
-    for x in range(sums.shape[1] - 2 * _HALF):
-        s, q = zero, zero
-        for c in range(_SIDE):
-            s += sums[0, x + c]
-            q += sums[1, x + c]
-        spread = q - s * s / area
-        weight[y, x + _HALF] = np.float32(1.0) / np.sqrt(spread) if spread > least else zero
+        _column_sums(half, y, columns, sums, squares)
+        _row_weights(sums, squares, y, columns, weight)
+    return pixels, (rows, columns), half, weight, between
 
 
 @vector_helper
