@@ -321,8 +321,7 @@ class FrameStatus(StrEnum):
     """How a frame ended.
 
     STARTED: the map begins, with the first frame that shows anything. TRACKED: the pose was measured against the map.
-    PREDICTED: no or too few matches: the pose is the motion model's. LOST: no match for several frames: that pose may
-    be far off. FAILED: the back end could not solve; the pose is the motion model's.
+    PREDICTED, FAILED: too few matches, or they have no solution: the pose is the motion model's. LOST: so for long.
     """
 
     STARTED = "started"
@@ -348,8 +347,7 @@ class FrameResult:
         report: the back end's report.
         features: of the frame, without those outside of the rectified image: rows count what is left.
         predicted: number of landmarks in the angle of view.
-        matched, matched_features: ids of landmarks associated with a feature (after the geometric check), and rows of
-            those features (K,).
+        matched, matched_features: ids of landmarks found, after the geometric check, and rows of their features (K,).
         added, added_features: ids of landmarks that joined the map, and rows of their features (A,).
         erased: ids of landmarks that left the map.
         map_size: number of landmarks in the map.
@@ -364,6 +362,7 @@ class FrameResult:
         keyframe: whether the frame has become a keyframe.
         returned: ids of landmarks of an old place that joined the map as another back end took over there.
         common: the part of the pose's error that all frames share; empty after a loop, which mixes it with noise.
+        recent: the last few poses in the back end's own world; None where it does not tell their joint covariance.
     """
 
     index: int
@@ -390,6 +389,7 @@ class FrameResult:
     keyframe: bool = False
     returned: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
     common: CommonError = field(default_factory=CommonError)
+    recent: RecentPoses | None = None
 
     def __repr__(self) -> str:
         why = f" ({self.reason})" if self.reason else ""

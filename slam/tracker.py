@@ -16,6 +16,7 @@ from slam.atlas.atlas import Atlas
 from slam.atlas.loop_closer import Found, LoopCloser
 from slam.atlas.map_io import SavedMap
 from slam.bodies.detector import ObjectDetector
+from slam.bodies.estimator import FRAMES
 from slam.calibration import RemainingRigError, SelfCalibration
 from slam.config import SystemConfig
 from slam.data import (
@@ -35,7 +36,7 @@ from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
 from slam.input.warnings import REPEATED
-from slam.interfaces import AligningFrontend, Backend, Frontend, MapBackend, RestingBackend
+from slam.interfaces import AligningFrontend, Backend, Frontend, MapBackend, RecentBackend, RestingBackend
 from slam.object_data import MovingObject
 from slam.third_party import checked
 from slam.tracks.alignment import align, take_patches
@@ -223,12 +224,13 @@ class Tracker:
         """The camera's pose after an update; the rig's calibration learns from the frame."""
         self.calibration.observe(changed(step.measured, images=None), step.pose)
         estimate: Estimate = checked(state.backend, "estimate", state.backend.estimate(landmarks=False))
-        return changed(step, estimate=estimate)
+        recent = state.backend.recent(FRAMES + 1) if isinstance(state.backend, RecentBackend) else None
+        return changed(step, estimate=estimate, recent=recent)
 
     def classify(self, state: State, step: Step) -> Step:
         """Which features move, and the moving bodies."""
         features, standing = step.features, step.standing
-        labels, objects = self.objects.step(state.backend, step.tracks, features, step.estimate, standing.witnesses)
+        labels, objects = self.objects.step(step.recent, step.tracks, features, step.estimate, standing.witnesses)
         if standing.stands:  # a feature that does not stay is undecided, unless it moves
             leaving = np.setdiff1d(np.arange(len(features)), standing.witnesses)
             undecided = np.setdiff1d(np.union1d(labels.undecided, leaving), labels.moving)
@@ -296,6 +298,7 @@ def frame_result(
         keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index,
         returned=step.joined,
         common=common,
+        recent=step.recent,
     )  # fmt: skip
 
 

@@ -32,7 +32,6 @@ from slam.data import BoolArray, Estimate, IdArray, IndexArray, RecentPoses, Ste
 from slam.geometry.arrays import among, median
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, transform
-from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
 from slam.tracks.table import Tracks
@@ -69,12 +68,14 @@ class ObjectDetector:
         """Take note that `correct` takes rectified rows (uL, vL, uR) (N, 3) [px] of before to what they are now."""
 
     def step(
-        self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate, still: IndexArray
+        self, recent: RecentPoses | None, tracks: Tracks, features: StereoFeatures, estimate: Estimate,
+        still: IndexArray,
     ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
         """Say which features move, before any of them becomes a landmark, and report the bodies.
 
         The table changes in place; landmarks that were found have their feature already. `estimate` is that after the
-        update, `still` are rows of features that stay at their pixels while the camera stands.
+        update, `recent` the last poses if the back end knows how their errors hang together, and `still` are rows of
+        features that stay at their pixels while the camera stands.
         """
         none = np.zeros(0, np.intp)
         return MotionLabels(none, none, np.zeros(0, np.int64)), ()
@@ -121,11 +122,11 @@ class MovingObjectDetector(ObjectDetector):
         return np.sort(tracks.ids[(tracks.ids >= 0) & (tracks.parted > 0)])
 
     def step(
-        self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate,
+        self, recent: RecentPoses | None, tracks: Tracks, features: StereoFeatures, estimate: Estimate,
         still: IndexArray = _NONE,
     ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
         """Follow all tracks into this frame, test them, and find bodies; see `ObjectDetector`."""
-        frame = self._begin(backend, tracks, features, estimate)
+        frame = self._begin(recent, tracks, features, estimate)
         self._advance_bodies(tracks, frame)
         follow(tracks, self.bodies, frame)
         self._measure(tracks, frame)
@@ -154,7 +155,7 @@ class MovingObjectDetector(ObjectDetector):
         self._begin_tracks(tracks, frame)
         return self._motion_labels(tracks, frame), reported(self.bodies, tracks)
 
-    def _begin(self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate) -> Frame:
+    def _begin(self, recent: RecentPoses | None, tracks: Tracks, features: StereoFeatures, estimate: Estimate) -> Frame:
         """Move on by a frame; nothing is followed into the first one."""
         s = self.setup
         self._number += 1
@@ -166,7 +167,7 @@ class MovingObjectDetector(ObjectDetector):
         measured = among(len(local), tracks.row[tracks.row >= 0])
         measuring = local[measured & np.isfinite(local[:, 0])]
         self._path = with_estimate(self._path, estimate, s.rig, s.sigma, measuring, FRAMES + 1)
-        cameras = recent_poses(backend, FRAMES + 1, self._path, estimate.covariance)
+        cameras = recent_poses(recent, FRAMES + 1, self._path, estimate.covariance)
         return Frame(s, self._number, features, local, self._stamps.copy(), self._poses.copy(), cameras)
 
     def _advance_bodies(self, tracks: Tracks, frame: Frame) -> None:

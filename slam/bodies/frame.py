@@ -13,7 +13,6 @@ from slam.bodies.config import ObjectsConfig
 from slam.data import Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
-from slam.interfaces import Backend, RecentBackend
 from slam.models import EstimatorModels, ObjectModels
 
 _SHARE = 0.05  # of the depth, as the radius of what may be a body where bodies have no least size
@@ -121,7 +120,7 @@ def with_estimate(
     return RecentPoses(stamps, poses, blocks)
 
 
-def recent_poses(backend: Backend, n: int, path: RecentPoses, covariance: Array) -> RecentPoses:
+def recent_poses(recent: RecentPoses | None, n: int, path: RecentPoses, covariance: Array) -> RecentPoses:
     """The camera's last n poses as the back end gives them, or else by its online poses.
 
     Over a few frames nearly all of an online pose's uncertainty is one error that they share: the place in the map. So
@@ -129,10 +128,8 @@ def recent_poses(backend: Backend, n: int, path: RecentPoses, covariance: Array)
     newest pose has just its covariance (6, 6). A back end that has corrected its past may give fewer poses for a while.
     """
     k = len(path)
-    if isinstance(backend, RecentBackend):
-        recent = backend.recent(n)
-        if len(recent) >= min(n, k):
-            return recent
+    if recent is not None and len(recent) >= min(n, k):
+        return recent
     by_newest = adjoint(inverse(path.poses) @ path.poses[-1])  # of a common error, as each pose's perturbation
     newest = path.covariance[-6:, -6:]
     stacked = by_newest.reshape(6 * k, 6)

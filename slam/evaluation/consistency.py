@@ -1,10 +1,12 @@
 """Whether pose covariances are as large as the errors: NEES from the start, and over stretches of the path.
 
 With ``T_true = T_estimated exp(e)`` the error of the relative pose from frame i to frame j is, to first order,
-``e_j − A e_i`` with ``A = Ad((T_i⁻¹ T_j)⁻¹)``. Errors of odometry by noise grow by increments that do not depend on
-what was before, so the covariance of that difference is ``N_j − A N_i Aᵀ``. Errors of the rig are the same in all
-frames: poses are off by ``J_i δ``, so they add ``(J_j − A J_i) Σ (J_j − A J_i)ᵀ`` with Σ as known in frame j. Where an
-old place is measured again the former may not be positive definite; such stretches are left out and counted.
+``e_j − A e_i`` with ``A = Ad((T_i⁻¹ T_j)⁻¹)``. Noise makes the errors that are in the covariances N; with C the
+covariance of the later one with the earlier (`slam.evaluation.joint_errors`), that of the difference is
+``N_j + A N_i Aᵀ − C Aᵀ − A Cᵀ``. Where the back end does not tell C, errors count as those of dead reckoning, which
+grow by increments that do not depend on what was before: ``C = A N_i``. Errors of the rig are the same in all frames:
+poses are off by ``J_i δ``, so they add ``(J_j − A J_i) Σ (J_j − A J_i)ᵀ`` with Σ as known in frame j. Where the result
+is not positive definite, stretches are left out and counted.
 
 Truth has errors of its own, the first pose included: else its turn would count as an error of the whole path. Their
 covariance is added, and stretches over which the truth contradicts itself are left out
@@ -20,6 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from slam.data import CommonError
+from slam.evaluation.joint_errors import JointErrors
 from slam.evaluation.metrics import chi_square_band, nees, pose_residuals
 from slam.evaluation.truth_error import RowArray, doubtful, interpolated, truth_covariances
 from slam.geometry.arrays import Array, BoolArray
@@ -45,12 +48,13 @@ _ROUNDING = 1e-14  # eigenvalues below this share of the largest are rounding
 
 def consistency_figures(
     own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise,
-    common: Sequence[CommonError] | None = None,
+    common: Sequence[CommonError] | None = None, joint: JointErrors | None = None,
 ) -> dict[str, float]:  # fmt: skip
     """The figures of a run's summary; those that the path is too short for are left out.
 
     The first pose defines the world and is left out; the start is the first pose whose truth was measured. The online
-    path has covariances (N, 6, 6), of which the poses share `common` (N), and the truth the same stamps.
+    path has covariances (N, 6, 6), of which the poses share `common` (N), and the truth the same stamps; `joint` is of
+    the rest of its errors.
 
     Returns:
         "mean NEES" from the start, "NEES over L m" for each of `STRETCHES`; six is right for all of these, and "band
@@ -60,24 +64,24 @@ def consistency_figures(
     """
     start = int(np.argmin(interpolated(true, noise)))  # the first pose that was measured
     later = np.arange(start + 1, len(own))
-    from_start = stretch_nees(own, true, covariances, noise, np.full(len(later), start), later, common)
+    from_start = stretch_nees(own, true, covariances, noise, np.full(len(later), start), later, common, joint)
     low, high = chi_square_band(_DOF)  # of one value: errors of the rig make all frames of a run as good as one
     figures = {"mean NEES": _mean(from_start), "band low": low, "band high": high, "dof": float(_DOF)}
     exact, noisy = TruthNoise(), noise != TruthNoise()
     if noisy:
-        of_exact = stretch_nees(own, true, covariances, exact, np.full(len(later), start), later, common)
+        of_exact = stretch_nees(own, true, covariances, exact, np.full(len(later), start), later, common, joint)
         figures["mean NEES, truth exact"] = _mean(of_exact[np.isfinite(from_start)])
     closed = _closings(covariances)
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(true.positions, axis=0), axis=1).cumsum()])
     for length in STRETCHES:
         last = np.searchsorted(along, along + length).astype(np.intp)
         starts = np.flatnonzero(last < len(own))
-        values = stretch_nees(own, true, covariances, noise, starts, last[starts], common)
+        values = stretch_nees(own, true, covariances, noise, starts, last[starts], common, joint)
         values[closed[starts] != closed[last[starts]]] = np.nan
         if np.isfinite(values).any():
             figures[f"NEES over {length:g} m"] = _mean(values)
             if noisy:
-                of_exact = stretch_nees(own, true, covariances, exact, starts, last[starts], common)
+                of_exact = stretch_nees(own, true, covariances, exact, starts, last[starts], common, joint)
                 figures[f"NEES over {length:g} m, truth exact"] = _mean(of_exact[np.isfinite(values)])
         left_out = doubtful(true, noise, starts, last[starts])
         none = ~np.isfinite(values) & ~left_out
@@ -99,7 +103,7 @@ def _closings(covariances: Array) -> RowArray:
 
 def stretch_nees(
     own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise, first: RowArray, last: RowArray,
-    common: Sequence[CommonError] | None = None,
+    common: Sequence[CommonError] | None = None, joint: JointErrors | None = None,
 ) -> Array:  # fmt: skip
     """NEES (M,) of the relative poses between rows `first` and `last` (M,).
 
@@ -111,7 +115,16 @@ def stretch_nees(
     A = adjoint(inverse(estimated))
     common = common or [CommonError()] * len(own)
     noises = covariances - np.array([one.covariance for one in common])
-    N = noises[last] - A @ noises[first] @ np.swapaxes(A, 1, 2) + truth_covariances(true, noise, first, last, A)
+    earlier, At = A @ noises[first], np.swapaxes(A, 1, 2)
+    told = np.full_like(earlier, np.nan) if joint is None else joint.between(first, last)
+    shared = np.where(np.isfinite(told), told, earlier) @ At
+    N = (
+        noises[last]
+        + earlier @ At
+        - shared
+        - np.swapaxes(shared, 1, 2)
+        + truth_covariances(true, noise, first, last, A)
+    )
     N, G = _shared(A, [(common[i], common[j]) for i, j in zip(first, last)], N)
     N = 0.5 * (N + np.swapaxes(N, 1, 2))
     usable = np.isfinite(residuals).all(axis=1) & ~doubtful(true, noise, first, last)

@@ -11,6 +11,7 @@ import numpy as np
 from slam.data import CommonError
 from slam.errors import TrajectoryError
 from slam.evaluation.consistency import BEFORE, consistency_figures
+from slam.evaluation.joint_errors import JointErrors
 from slam.evaluation.metrics import absolute_errors, associate, relative_errors, segment_errors
 from slam.geometry.se3 import Array, inverse, so3_log
 from slam.geometry.trajectory import Trajectory, TruthNoise
@@ -91,7 +92,11 @@ def rotation_errors(own: Trajectory, true: Trajectory, mounting: float) -> Array
 
 
 def consistency(
-    estimate: Trajectory, covariances: Array, sequence: Any, common: Sequence[CommonError] | None = None
+    estimate: Trajectory,
+    covariances: Array,
+    sequence: Any,
+    common: Sequence[CommonError] | None = None,
+    joint: JointErrors | None = None,
 ) -> dict[str, float]:
     """How honest the pose covariances are, from the first pose that has truth; empty where none has.
 
@@ -102,6 +107,7 @@ def consistency(
         covariances: of its poses (N, 6, 6).
         sequence: with ground truth or without; its `truth_noise`, where it has one, is that of the truth.
         common: the part of the covariances that the poses share (N); None where that is not known, or nothing.
+        joint: how the rest of the poses' (N) errors hang together; None where that is not known.
     """
     pairs = with_truth(estimate, sequence)
     if pairs is None:
@@ -109,5 +115,6 @@ def consistency(
     rows = np.searchsorted(estimate.stamps, pairs[0].stamps)
     noise = getattr(sequence, "truth_noise", TruthNoise())
     shared = None if common is None else [common[row] for row in rows]
-    found = _where_possible(consistency_figures, *pairs, covariances[rows], noise, shared)
+    joint = None if joint is None else joint.select(rows)
+    found = _where_possible(consistency_figures, *pairs, covariances[rows], noise, shared, joint)
     return found | ({BEFORE: float(rows[0])} if rows[0] and found else {})

@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 
 from slam.checks import LATEST_STAMP, unit_doubt
-from slam.data import BoolArray, Estimate, FrameResult, ImagePair, Observations, StereoFeatures, StereoFrame
+from slam.data import (
+    BoolArray,
+    Estimate,
+    FrameResult,
+    ImagePair,
+    Observations,
+    RecentPoses,
+    StereoFeatures,
+    StereoFrame,
+)
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry.arrays import changed, median
 from slam.geometry.rig import StereoRig
@@ -198,6 +207,7 @@ class Rectification:
             estimate=self.estimate_out(result.estimate),
             features=changed(f, uv_left=left, uv_right=right, rectified=False),
             common=changed(common, jacobian=self._adjoint @ common.jacobian),
+            recent=self.recent_out(result.recent),
         )
 
     def estimate_out(self, estimate: Estimate) -> Estimate:
@@ -206,6 +216,13 @@ class Rectification:
             return estimate
         P = self._adjoint @ estimate.covariance @ self._adjoint.T
         return changed(estimate, T_world_left=estimate.T_world_left @ self._back, covariance=P)
+
+    def recent_out(self, recent: RecentPoses | None) -> RecentPoses | None:
+        """The last poses of the rig's own left camera, with their joint covariance; None of none."""
+        if self._none or recent is None:
+            return recent
+        J = np.kron(np.eye(len(recent)), self._adjoint)
+        return RecentPoses(recent.stamps, recent.poses @ self._back, J @ recent.covariance @ J.T)
 
     def path_out(self, path: Trajectory) -> Trajectory:
         """A path of the rig's own left camera."""

@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.detector import ObjectDetector
-from slam.data import Estimate, StereoFeatures
+from slam.data import Estimate, RecentPoses, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.files import Kind, read_bytes, require_arrays, unpack, whole_file
 from slam.geometry.arrays import isin
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, log, pose, transform
-from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
 from slam.tracks.follow import match_everywhere
@@ -193,11 +192,11 @@ class Procedure1Detector(ObjectDetector):
         self._last = None
 
     def step(
-        self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate, *_: object
+        self, recent: RecentPoses | None, tracks: Tracks, features: StereoFeatures, estimate: Estimate, *_: object
     ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
         """Recognise the object's features and find its motion; no other feature is classified.
 
-        The object is reported where it was measured in this frame; the back end is not asked.
+        The object is reported where it was measured in this frame.
         """
         d = self._database
         if d.descriptors.shape[1] != features.descriptors.shape[1]:

@@ -10,10 +10,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from slam.bodies.estimator import FRAMES
 from slam.data import FrameResult, FrameStatus, StereoFeatures, UpdateStatus
 from slam.geometry.rig import MINIMAL_POINTS, measurement_rows
 from slam.input.features import Rectification
-from slam.interfaces import Backend, RevisingBackend
+from slam.interfaces import Backend, RecentBackend, RevisingBackend
 from slam.run.recording import RecordedFrame, Recording
 from slam.third_party import checked, named_failures
 from slam.tracks.config import AssociationConfig
@@ -79,6 +80,7 @@ def _step(
         backend.remove(frame.removed[at_once])
     times.append(time.perf_counter())
     estimate = checked(backend, "estimate", backend.estimate(landmarks=False))
+    recent = backend.recent(FRAMES + 1) if isinstance(backend, RecentBackend) else None
     times.append(time.perf_counter())
     status, reason = FrameStatus.TRACKED, ""
     if report.status is UpdateStatus.FAILED:
@@ -103,6 +105,7 @@ def _step(
         status=status,
         reason=reason,
         estimate=inside.estimate_out(estimate),
+        recent=inside.recent_out(recent),
         report=report,
         features=features,
         predicted=len(prediction.ids),

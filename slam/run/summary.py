@@ -11,6 +11,7 @@ import numpy as np
 
 from slam.data import CommonError, Estimate, FrameResult
 from slam.evaluation.consistency import EXACT, PIXELS_ALONE, are_covariances
+from slam.evaluation.joint_errors import JointErrors, with_newest
 from slam.evaluation.objects import ObjectScore
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import Array
@@ -43,6 +44,7 @@ class RunRecord:
     statuses: list[str] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
     common: list[CommonError] = field(default_factory=list)
+    with_newest: list[Array] = field(default_factory=list)  # covariances of the last poses' errors with each one's own
     measured: list[bool] = field(default_factory=list)
     milliseconds: list[dict[str, float]] = field(default_factory=list)
     compiled_before: float = field(default_factory=compile_clock.seconds)  # [s]
@@ -80,6 +82,7 @@ class RunRecord:
         self.poses.append(result.estimate.T_world_left)
         self.covariances.append(result.estimate.covariance)
         self.common.append(result.common)
+        self.with_newest.append(with_newest(result.recent, self.stamps))
         self.measured.append(result.status.measured)
         self.rejected += len(result.report.rejected)
         self.used += len(result.report.used)
@@ -130,7 +133,8 @@ def results_of(
     if doubt:
         logger.warning("%s", doubt)
     speeds = np.linalg.norm(steps, axis=1) / np.diff(path.stamps)
-    common = [record.common[row] for row in np.flatnonzero(measured)]
+    rows = np.flatnonzero(measured)
+    common, joint = [record.common[row] for row in rows], JointErrors.of(record.with_newest, rows)
     found: dict[str, Any] = {
         "path_length_m": path.length,
         "speed_m_per_s": float(np.median(speeds)) if len(speeds) else None,
@@ -144,7 +148,7 @@ def results_of(
         },
         "consistency": {
             "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
-            **({} if doubt else consistency(online, np.array(record.covariances)[measured], sequence, common)),
+            **({} if doubt else consistency(online, np.array(record.covariances)[measured], sequence, common, joint)),
         },
     }
     if singular:

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
 from urllib.parse import quote
 
 import numpy as np
@@ -48,33 +48,22 @@ _MOST = 0.95  # share of images with a true pose, below which a line says how ma
 _NEAR = 0.02  # [s] of a true pose's stamp to an image's, as `slam.evaluation.metrics.associate` has it
 
 
-class _Format(NamedTuple):
-    matches: Callable[[Path], bool]  # whether a folder or file looks like it
-    open: Callable[[Path, Options, FaultLog], RecordedSequence]
-    description: str
+Matches = Callable[[Path], bool]  # whether a folder or file looks like a format
+Opener = Callable[[Path, Options, FaultLog], RecordedSequence]
 
-
-#: In the order in which they are tried.
-_FORMATS = {
-    "ros": _Format(
-        ros.matches_folder, ros.open_folder, "ROS 1 and 2: .bag, .mcap and .db3 files, and the folders of ROS 2"
-    ),
-    "euroc": _Format(euroc.matches_folder, euroc.open_folder, "EuRoC and other ASL folders: mav0/cam0, mav0/cam1"),
-    "kitti-raw": _Format(kitti.matches_drive, kitti.open_folder, "KITTI raw drives: image_00/data, image_01/data"),
-    "kitti": _Format(kitti.matches_folder, kitti.open_folder, "KITTI odometry sequences: image_0, image_1, calib.txt"),
-    "folders": _Format(
-        folders.matches_folder,
-        folders.open_folder,
-        "two folders or videos (left, right), or one with both (layout=sbs), and a calibration",
-    ),
+#: How each format is known and opened, in the order in which they are tried.
+_FORMATS: dict[str, tuple[Matches, Opener]] = {
+    "ros": (ros.matches_folder, ros.open_folder),
+    "euroc": (euroc.matches_folder, euroc.open_folder),
+    "kitti-raw": (kitti.matches_drive, kitti.open_folder),
+    "kitti": (kitti.matches_folder, kitti.open_folder),
+    "folders": (folders.matches_folder, folders.open_folder),
 }
 
 
-def formats() -> dict[str, str]:
-    """Names of the formats with a line on each."""
-    camera = "live cameras: camera:0 (both images side by side), camera:0,1, or addresses"
-    worlds = "built-in worlds: synthetic:NAME?key=value&key=value"
-    return {name: known.description for name, known in _FORMATS.items()} | {"camera": camera, "synthetic": worlds}
+def formats() -> tuple[str, ...]:
+    """Names of the formats."""
+    return (*_FORMATS, "camera", "synthetic")
 
 
 def open_sequence(path: str | Path, format: str | None = None, quiet: bool = False) -> Sequence:
@@ -130,9 +119,8 @@ def _open_folder(text: str, format: str | None, quiet: bool) -> RecordedSequence
     note_input(folder)
     lines: list[str] = []
     with FaultLog(lines, quiet=True) as faults:  # above an error nothing is said
-        found = (
-            _FORMATS[name].open(folder, options, faults) if name in _FORMATS else _own(name, folder, options, faults)
-        )
+        _, opener = _FORMATS.get(name, (None, partial(_own, name)))
+        found = opener(folder, options, faults)
         home = folder if folder.is_dir() else folder.parent
         masks = read_masks(options.get("mask"), home, found.rig)
         if "truth" in options:
@@ -199,7 +187,7 @@ def _exists(text: str) -> bool:
 
 
 def _format_of(folder: Path) -> str | None:
-    return next((name for name, known in _FORMATS.items() if known.matches(folder)), None)
+    return next((name for name, (matches, _) in _FORMATS.items() if matches(folder)), None)
 
 
 def _format_asked(folder: Path, query: str, text: str) -> str | None:

@@ -15,6 +15,7 @@ from slam.data import (
     IdArray,
     Observations,
     Prediction,
+    RecentPoses,
     StereoFeatures,
     UpdateReport,
     UpdateStatus,
@@ -176,6 +177,7 @@ class Step:
     suspects: IdArray = field(default_factory=_NONE.copy)  # ids of landmarks that may move
     report: UpdateReport = field(default_factory=lambda: UpdateReport.nothing(UpdateStatus.EMPTY, ""))  # of the update
     estimate: Estimate = _NOWHERE  # the camera's pose after the update
+    recent: RecentPoses | None = None  # the last poses by the back end, if it tells how their errors hang together
     labels: MotionLabels = field(default_factory=lambda: MotionLabels(_NONE, _NONE, _NONE))  # which features move
     objects: tuple[MovingObject, ...] = ()  # the moving bodies
     added: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)  # landmarks that joined the map

@@ -16,6 +16,7 @@ from slam.evaluation.metrics import nees
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
+from slam.interfaces import RecentBackend
 from slam.models import EstimatorModels, MotionModel, models_for
 from slam.object_data import ObjectEstimate, ObjectObservations
 
@@ -177,7 +178,8 @@ def follow(
         path = with_estimate(path, e, scene.rig, SIGMA, local[old & deep], FRAMES + 1)
         given = scene.observations(k, rng, outliers if k else 0.0)
         given = given if rule is None else rule(k, given)
-        belief = estimator.updated(belief, 7, given, recent_poses(backend, FRAMES + 1, path, e.covariance))
+        recent = backend.recent(FRAMES + 1) if isinstance(backend, RecentBackend) else None
+        belief = estimator.updated(belief, 7, given, recent_poses(recent, FRAMES + 1, path, e.covariance))
         if belief is not None:
             yield k, belief, e.T_world_left
         backend.add(seen.select(~old & deep))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +17,6 @@ from slam.tracks.table import Tracks
 from tests.slam.scene import RIG
 
 HERE = Estimate(0.0, np.eye(4), np.eye(6), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-NO_BACKEND: Any = SimpleNamespace()  # the camera's last poses are then the online ones
 
 
 def test_a_body_is_predicted_by_its_own_motion_model() -> None:
@@ -29,11 +26,11 @@ def test_a_body_is_predicted_by_its_own_motion_model() -> None:
     )
     detector, dt = MovingObjectDetector(RIG, ObjectsConfig(), models), 0.1
     tracks = Tracks.empty(64, detector.window)
-    detector.step(NO_BACKEND, tracks, StereoFeatures.empty(0.0), HERE)
+    detector.step(None, tracks, StereoFeatures.empty(0.0), HERE)
     times = np.zeros(detector.window)
     body = new_body(1, np.array([0, 0, 3.0]), np.array([0, 0.2, 0, 1.0, 0, 0]), times, 0.0, 0.1)
     detector.bodies[1] = body
-    detector.step(NO_BACKEND, tracks, StereoFeatures.empty(dt), replace(HERE, stamp=dt))
+    detector.step(None, tracks, StereoFeatures.empty(dt), replace(HERE, stamp=dt))
     grown = np.diag(detector.bodies[1].covariance - body.covariance)
     np.testing.assert_allclose(grown, dt**3 * np.array([0.5] * 3 + [2.0] * 3) ** 2, rtol=1e-9)
     np.testing.assert_allclose(detector.bodies[1].T[:3, 3], [dt, 0, 3.0])

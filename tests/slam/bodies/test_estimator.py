@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -267,7 +266,7 @@ def test_derived_recent_poses():
         backend.add(seen.select(~old))
         known.update(seen.ids.tolist())
     wide = e.covariance + np.diag([0, 0, 0, 1.0, 1, 1])
-    recent = recent_poses(SimpleNamespace(), 3, path, wide)  # a back end without `recent`
+    recent = recent_poses(None, 3, path, wide)  # a back end without `recent`
     assert len(recent) == 3 and recent.stamps[-1] == scene.stamps[-1]
     assert recent.covariance[-6:, -6:] == pytest.approx(wide)
     J = np.concatenate([-se3.adjoint(se3.inverse(recent.poses[2]) @ recent.poses[1]), np.eye(6)], axis=1)

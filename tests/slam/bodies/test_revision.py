@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 
 from slam.bodies.config import ObjectsConfig
@@ -19,7 +17,6 @@ RIG = StereoRig.rectified_pair(700.0, 620, 188, 0.54, 1241, 376)
 CHANGE = 0.4  # of all disparities [px]
 FRAMES, AT = 8, 5  # the correction changes before this frame
 DT = 0.1
-NO_BACKEND = SimpleNamespace()  # the camera's last poses are then the online ones
 NO_LANDMARKS = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))
 
 
@@ -52,7 +49,7 @@ def velocities(revised):
         features = features_at(T, points, k)
         estimate = Estimate(features.stamp, T, 1e-6 * np.eye(6), *NO_LANDMARKS)
         tracks = tracks.begun(len(points), detector.window)
-        detector.step(NO_BACKEND, tracks, features, estimate)
+        detector.step(None, tracks, features, estimate)
     rows = np.flatnonzero(tracks.found)
     times = np.nan_to_num(detector._stamps - features.stamp)
     return constant_velocity(tracks, rows, times, 25.0).velocity[:, 2]

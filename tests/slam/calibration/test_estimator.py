@@ -170,16 +170,6 @@ def test_a_change_that_does_not_count_is_not_applied():
     assert calibration.apply() is None
 
 
-def test_nothing_seen_is_no_error():
-    calibration = SelfCalibration(CAR, SelfCalibrationConfig())
-    features = Street().features(0.0, pose(0), most=3)
-    for uv_right in (features.uv_right, np.full_like(features.uv_right, np.nan)):
-        calibration.observe(replace(features, uv_right=uv_right), pose(0))
-    calibration.observe(replace(features, descriptors=np.zeros((len(features), 0), np.float32)), pose(1))
-    assert calibration.apply() is None
-    assert calibration.summary()["pairs"] == 0
-
-
 @pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 def test_a_revision_does_not_move_the_camera(backend):
     """Landmarks follow the new correction: else a sudden change of all pixels looks like motion.

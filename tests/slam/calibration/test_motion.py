@@ -91,5 +91,5 @@ def test_a_motion_is_found_to_the_end():
     views, R, t = noisy_views(0.2, 0.2)
     noise = np.diag([0.2, 0.2, 0.2]) ** 2
     near, far = (fit_motion(*views, R, t + off, F, noise) for off in (np.zeros(3), np.array([0.5, 0.3, 1.0])))
-    np.testing.assert_allclose(near.linear.moved, far.linear.moved, atol=0.02)
+    np.testing.assert_allclose(near.moved, far.moved, atol=0.02)
     assert np.abs(near.t - t).max() < 0.1

@@ -9,6 +9,7 @@ import pytest
 
 from slam.data import CommonError
 from slam.evaluation.consistency import consistency_figures, stretch_nees
+from slam.evaluation.joint_errors import JointErrors
 from slam.evaluation.summary import evaluate
 from slam.geometry.se3 import adjoint, exp, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
@@ -50,6 +51,42 @@ def test_relative_nees_of_honest_odometry_is_six():
 
 def test_relative_nees_tells_covariances_that_are_too_small():
     assert mean_over_seeds(claimed=0.2)["NEES over 10 m"] > 60
+
+
+def with_noise_of_each_frame(seed: int) -> tuple[Trajectory, Trajectory, np.ndarray, list[np.ndarray]]:
+    """Odometry with online poses that have an error of their own in each frame, which later frames do not have.
+
+    It is as large as the growth over nine frames. Last come the covariances of five errors with the newest of them.
+    """
+    own, true, P = odometry(seed)
+    rng, alone, A = np.random.default_rng([seed, 2]), 9 * np.diag(SIGMA**2), adjoint(inverse(exp(STEP)))
+    own = Trajectory(own.stamps, own.poses @ exp(3 * SIGMA * rng.normal(size=(len(own), 6))))
+    blocks = []
+    for k in range(len(own)):
+        earlier = [P[k - lag] @ np.linalg.matrix_power(A, lag).T for lag in range(min(k, 4), 0, -1)]
+        blocks.append(np.array([*earlier, P[k] + alone]))
+    return own, true, P + alone, blocks
+
+
+def test_errors_of_each_frame_alone_are_told_from_drift_by_the_last_poses():
+    every, joint, alone = np.arange(60), [], []
+    for seed in range(40):
+        own, true, P, blocks = with_noise_of_each_frame(seed)
+        joint.append(consistency_figures(own, true, P, NONE, None, JointErrors.of(blocks, every)))
+        alone.append(consistency_figures(own, true, P, NONE))
+    for key in ("mean NEES", "NEES over 1 m", "NEES over 10 m"):
+        assert 4.0 < np.mean([run[key] for run in joint]) < 7.0, key
+    assert not any("no covariance" in key for run in joint for key in run)
+    assert np.mean([run["NEES over 10 m"] for run in alone]) > 9.0
+
+
+def test_joint_errors_are_not_known_across_a_frame_before_which_there_is_no_pose():
+    *_, P, blocks = with_noise_of_each_frame(0)
+    blocks[30] = blocks[30][-1:]
+    first, last = np.array([5, 28, 29, 31, 40, 7]), np.array([20, 30, 40, 34, 55, 7])
+    found = JointErrors.of(blocks, np.arange(60)).between(first, last)
+    assert np.isfinite(found).all(axis=(1, 2)).tolist() == [True, False, False, True, True, True]
+    assert np.allclose(found[3], blocks[34][1].T) and np.allclose(found[5], P[7])
 
 
 def test_a_constant_turn_of_the_truths_sensor_is_no_rotation_error():
