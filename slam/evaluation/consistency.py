@@ -6,7 +6,7 @@ covariance of the later one with the earlier (`slam.evaluation.joint_errors`), t
 ``N_j + A N_i Aᵀ − C Aᵀ − A Cᵀ``. Where the back end does not tell C, errors count as those of dead reckoning, which
 grow by increments that do not depend on what was before: ``C = A N_i``. Errors of the rig are the same in all frames:
 poses are off by ``J_i δ``, so they add ``(J_j − A J_i) Σ (J_j − A J_i)ᵀ`` with Σ as known in frame j. Where the result
-is not positive definite, stretches are left out and counted.
+is not positive definite, stretches are left out and counted; where most are, that length has no figure.
 
 Truth has errors of its own, the first pose included: else its turn would count as an error of the whole path. Their
 covariance is added, and stretches over which the truth contradicts itself are left out
@@ -43,6 +43,7 @@ BEFORE = "poses before the truth"
 
 _DOF = 6
 _SMALLEST = 1e-12  # eigenvalue of a covariance [rad², m²] below which it is none
+_MOST = 0.5  # share of the stretches without a covariance above which a length has no figure
 _ROUNDING = 1e-14  # eigenvalues below this share of the largest are rounding
 
 
@@ -74,10 +75,10 @@ def consistency_figures(
         starts = np.flatnonzero(last < len(own))
         values = stretch_nees(own, true, covariances, noise, starts, last[starts], common, joint)
         values[closed[starts] != closed[last[starts]]] = np.nan
-        if np.isfinite(values).any():
-            figures[f"NEES over {length:g} m"] = _mean(values)
         left_out = doubtful(true, noise, starts, last[starts])
         none = ~np.isfinite(values) & ~left_out
+        if np.isfinite(values).any() and none.mean() <= _MOST:
+            figures[f"NEES over {length:g} m"] = _mean(values)
         for what, rows in (("doubtful truth", left_out), ("no covariance", none)):
             if rows.any():
                 figures[f"{what} over {length:g} m"] = float(np.mean(rows))

@@ -129,19 +129,17 @@ _RATIOS = {
     "ratio_100m": "over 100 m",
 }
 _OF_A_PATH = {"loops_closed", "path_m", "speed", "sigma_m"}
-_FEW = 0.5  # a NEES over less than this share of the stretches is no figure: they are hardly a fair choice
 
 
 def figures(summary: Mapping[str, Any]) -> dict[str, float]:
     """What a run's summary says, by key of `METRICS`; what it does not say is left out."""
     bodies = [body for body in _at(summary, "objects/bodies", {}).values() if body["frames in view"]]
-    honest, found = summary.get("consistency") or {}, {}
+    found: dict[str, float] = {}
     for m in METRICS:
         before, each, own = m.place.partition("/*/")
         values = [_at(body, own) for body in bodies] if each else [_at(summary, before)] if before else []
         known = [float(value) for value in values if value is not None]
-        few = (honest.get(f"no covariance {_RATIOS.get(m.key)}") or 0.0) > _FEW
-        if known and not few and (bodies or "moving" not in m.key):  # what is found of nothing is no figure
+        if known and (bodies or "moving" not in m.key):  # what is found of nothing is no figure
             mean = float(np.mean(known))
             found[m.key] = float(np.sqrt(mean / 6)) if m.better == "one" else mean  # of NEES, where 6 is right
     if frames := summary.get("frames", 0):

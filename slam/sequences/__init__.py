@@ -197,8 +197,12 @@ def _format_asked(folder: Path, query: str, text: str) -> str | None:
     if ros.matches_folder(folder):
         return "ros"
     if not folder.exists():
-        what = "file or folder" if folder.suffix else "folder"
-        raise SequenceError(f"{folder}: there is no such {what}{_hint_name(text)}")
+        from slam import worlds
+
+        name, mark, options = text.partition("?")
+        near = nearest(name, worlds.names())
+        hint = f" (did you mean 'synthetic:{near}{mark}{options}'?)" if near else ""
+        raise SequenceError(f"{folder}: there is no such {'file or folder' if folder.suffix else 'folder'}{hint}")
     if not folder.is_dir() and "layout" not in named:
         hint = "; give the folder that holds both cameras' images, unpacked"
         if folder.suffix.lower() in VIDEO_SUFFIXES:
@@ -208,15 +212,6 @@ def _format_asked(folder: Path, query: str, text: str) -> str | None:
     if folder.is_dir() and not any(folder.iterdir()):
         raise SequenceError(f"{folder}: the folder is empty")
     return "folders" if named & {"left", "right", "layout"} else format_of(folder)
-
-
-def _hint_name(text: str) -> str:
-    """A world with a similar name than what was asked for."""
-    from slam import worlds
-
-    name, mark, query = text.partition("?")
-    near = nearest(name, worlds.names())
-    return f" (did you mean 'synthetic:{near}{mark}{query}'?)" if near else ""
 
 
 def _hint_near(folder: Path) -> str:

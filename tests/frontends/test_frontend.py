@@ -148,9 +148,8 @@ def test_no_cell_takes_all():
     poster = rng.uniform((0, 0), (40, 40), (500, 2))  # the strongest 500 lie in one corner
     rest = rng.uniform((0, 0), (320, 240), (500, 2))
     uv = np.concatenate([poster, rest])
-    kept = spread(uv, 200, (8, 6), (320, 240))
+    kept = np.flatnonzero(spread(uv, 200, (8, 6), (320, 240)))
     assert len(kept) == 200
-    assert (np.diff(kept) > 0).all()
     assert (kept < 500).mean() < 0.15
     cells = set(map(tuple, (uv[kept] // 40).astype(int)))
     assert len(cells) == 48
@@ -159,5 +158,5 @@ def test_no_cell_takes_all():
 def test_what_poor_cells_leave_goes_to_the_strongest():
     rng = np.random.default_rng(0)
     uv = rng.uniform((0, 0), (40, 40), (500, 2))
-    assert np.array_equal(spread(uv, 200, (8, 6), (320, 240)), np.arange(200))
-    assert np.array_equal(spread(uv[:50] - 1, 50, (8, 6), (320, 240)), np.arange(50))
+    assert np.array_equal(spread(uv, 200, (8, 6), (320, 240)), np.arange(500) < 200)
+    assert spread(uv[:50] - 1, 50, (8, 6), (320, 240)).all()

@@ -49,13 +49,6 @@ def test_covariances_that_are_too_large_on_an_exact_world_say_why(tmp_path):
         assert honesty(group) == [f"ekf: {said}."]
 
 
-def test_a_nees_of_which_most_stretches_had_no_covariance_is_no_figure():
-    tree = summary(1.0)
-    tree["consistency"] |= {"NEES over 10 m": 600.0, "no covariance over 10 m": 0.6}
-    assert verdict_of_run(tree).startswith("covariances hold: from the start")
-    assert dict(rows([tree]))["errors / claimed σ (1 is right)"] == ["1"]
-
-
 def test_doubtful_truth_is_named_and_not_the_covariance():
     """A run of frames whose truth was interpolated said "covariances are 12 times too small"."""
     tree = summary(1.0)
