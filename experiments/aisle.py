@@ -19,11 +19,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import AssociationCheck, script_options
 from experiments.tables import show
-from frontends import create
+from frontends.surf import SurfFrontend
 from slam.config import SystemConfig
 from slam.data import StereoFeatures, StereoFrame
+from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
-from slam.interfaces import Frontend
 from slam.registry import ONLINE
 from slam.run.options import RunOptions
 from slam.run.plots import plot
@@ -37,17 +37,17 @@ HEADER = (
 )  # fmt: skip
 
 
-class Remembered:
-    """A front end that does its work once for each frame and remembers."""
+class Remembered(SurfFrontend):
+    """The front end, which does its work once for each frame and remembers."""
 
-    def __init__(self, frontend: Frontend) -> None:
-        self._frontend = frontend
+    def __init__(self, rig: StereoRig, **options: Any) -> None:
+        super().__init__(rig, **options)
         self._features: dict[int, StereoFeatures] = {}
 
     def extract(self, frame: StereoFrame) -> StereoFeatures:
         """See `slam.interfaces.Frontend`."""
         if frame.index not in self._features:
-            self._features[frame.index] = self._frontend.extract(frame)
+            self._features[frame.index] = super().extract(frame)
         return self._features[frame.index]
 
 
@@ -86,7 +86,7 @@ def main() -> int:
     arguments = parser.parse_args()
     sequence = open_sequence("synthetic:aisle?frames=30" if arguments.quick else "synthetic:aisle")
     config = SystemConfig.for_kind(sequence.kind)
-    frontend = Remembered(create("surf", sequence.rig, **config.frontend))
+    frontend = Remembered(sequence.rig, **config.frontend)
     rows = [row(sequence, backend, frontend, config, arguments.out) for backend in ONLINE]
     runs = [RunData.read(arguments.out / backend, backend) for backend in ONLINE]
     plot(runs, arguments.out / "top_view.png", "map")
