@@ -171,9 +171,10 @@ def write_video(path: Path, images: list[np.ndarray], codec: str = "mp4v", rate:
     writer.release()
 
 
-def write_opencv(path: Path, rig: StereoRig) -> None:
-    """Write a rig with the entries of ``cv2.stereoCalibrate`` [m]."""
-    entries = {"image_width": rig.width, "image_height": rig.height, "R": rig.R, "T": (rig.R @ rig.b).reshape(3, 1)}
+def write_opencv(path: Path, rig: StereoRig, unit: float = 1.0) -> None:
+    """Write a rig with the entries of ``cv2.stereoCalibrate``, lengths in `unit` to the metre."""
+    T = unit * (rig.R @ rig.b).reshape(3, 1)
+    entries = {"image_width": rig.width, "image_height": rig.height, "R": rig.R, "T": T}
     for number, camera in enumerate((rig.left, rig.right), 1):
         entries |= {f"K{number}": camera.K, f"D{number}": np.array([camera.distortion or (0.0,) * 4])}
     write_storage(path, entries)

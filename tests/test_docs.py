@@ -19,7 +19,7 @@ from slam.errors import SlamError
 from slam.evaluation.metrics import absolute_errors
 from slam.geometry import se3
 from slam.settings import can_be_set
-from tests.recordings import write_storage, write_video
+from tests.recordings import write_opencv, write_video
 from tests.scripts import load_script
 
 ROOT = Path(__file__).parent.parent
@@ -103,8 +103,7 @@ def test_a_bag_is_written_and_read_again(tmp_path, monkeypatch, rig, name):
 def test_the_webcam_writes_a_path(tmp_path, monkeypatch, capsys):
     text = (DOCS / "examples" / "webcam.py").read_text()
     sequence = slam.open_sequence("synthetic:desk?frames=8&width=160&height=120")
-    K, T = sequence.rig.left.K, sequence.rig.R @ sequence.rig.b
-    write_storage(tmp_path / "calibration.yaml", {"K1": K, "K2": K, "R": np.eye(3), "T": T})
+    write_opencv(tmp_path / "calibration.yaml", sequence.rig)
     write_video(tmp_path / "both.avi", [np.hstack([f.left, f.right]) for f in sequence], "MJPG", 5.0)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["webcam.py", "both.avi?layout=sbs"])

@@ -48,7 +48,7 @@ class Body:
     measured: bool = True  # whether it was in this frame
     moving: bool = True  # whether it moves now
     evidence: float = 0.0  # evidence that it has moved, given all that is uncertain; see `slam.bodies.proof`
-    far: bool = False  # whether it was followed for farther than it is wide before it became a body
+    far: bool = False  # whether it was followed for farther than it is wide
     certain: int = 0  # what frames so far count for the proof that it moves, see `slam.bodies.proof`
     agreeing: int = 0  # number of members, added over frames, that went with it rather than stood still
     against: int = 0  # number of others inside its extent, added over frames, that rather stood still
@@ -66,6 +66,19 @@ class Body:
         return self.certain >= PROOF and self.agreeing >= SOLID * (self.agreeing + self.against)
 
     @property
+    def unplaced(self) -> bool:
+        """Whether it may be farther from where it is expected, seen from the camera, than it is wide."""
+        if self.belief is None:
+            return True
+        since = np.trace((self.covariance - self.belief.estimate.covariance)[3:, 3:])
+        return bool(self.belief.spread**2 + since > self.across**2)
+
+    @property
+    def gone(self) -> bool:
+        """Whether it is out of view, and may be anywhere."""
+        return self.missed > 1 and self.unplaced
+
+    @property
     def solid(self) -> float:
         """Twice the log odds, no more than is clear, that what is inside goes with it, by those that clearly did."""
         return min(2.0 * math.log((self.agreeing + 1.0) / (self.against + 1.0)), CLEAR)
@@ -74,6 +87,11 @@ class Body:
     def across(self) -> float:
         """Diagonal of its extent, but no less than its least size [m]."""
         return max(math.dist(self.upper, self.lower), self.size)
+
+    @property
+    def went(self) -> float:
+        """How far it is from where its estimate began [m]."""
+        return 0.0 if self.belief is None else math.dist(self.T[:3, 3], self.belief.T_begun[:3, 3])
 
     @property
     def middle(self) -> Array:
@@ -121,8 +139,10 @@ def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
     )  # fmt: skip
 
 
-def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_speed: float) -> Body:
-    """The body as it is estimated in the present frame."""
+def with_belief(body: Body, belief: BodyBelief | None, slot: int, stamp: float, min_speed: float) -> Body:
+    """The body as it is estimated in the present frame; as it was predicted where there is no estimate."""
+    if belief is None:
+        return replace(body, belief=None)
     estimate = belief.estimate
     size = 0.5 * float(np.linalg.norm(body.upper - body.lower))
     v, P = estimate.velocity, estimate.velocity_covariance
@@ -137,6 +157,14 @@ def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_spe
         estimate.T_world_object, slot, estimate.measured, covariance=estimate.covariance, velocity=v,
         velocity_covariance=P, belief=belief,
         moving=body.seen <= MIN_FRAMES or (certain and speed > min_speed), **changes,
+    )  # fmt: skip
+
+
+def returned(body: Body, T: Array, slot: int, stamp: float) -> Body:
+    """A body that is seen again, at a pose (4, 4); its estimate begins anew."""
+    return body.placed(
+        T, slot, True, T_before=T, covariance=_SPREAD**2 * np.eye(6), seen_at=stamp, seen=body.seen + 1, missed=0,
+        belief=None,
     )  # fmt: skip
 
 

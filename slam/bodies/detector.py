@@ -15,6 +15,7 @@ from slam.bodies.bodies import (
     hidden,
     of_bodies,
     reported,
+    returned,
     with_belief,
     with_evidence,
     with_extent,
@@ -23,7 +24,7 @@ from slam.bodies.config import CLEAR, MIN_FRAMES, RUN, WINDOW, ObjectsConfig
 from slam.bodies.estimator import FRAMES, BodyEstimator
 from slam.bodies.finder import Scene, parting
 from slam.bodies.fits import fit_positions, fit_velocities, record, revise_tracks
-from slam.bodies.following import follow, located, observed
+from slam.bodies.following import follow, found_again, located, observed
 from slam.bodies.frame import NO_IDS, Frame, Setup, recent_poses, with_estimate
 from slam.bodies.membership import merge
 from slam.bodies.proof import Way, with_frame
@@ -171,10 +172,10 @@ class MovingObjectDetector(ObjectDetector):
         return Frame(s, self._number, features, local, self._stamps.copy(), self._poses.copy(), cameras)
 
     def _advance_bodies(self, tracks: Tracks, frame: Frame) -> None:
-        """Predict all bodies; forget those that were not seen for long."""
+        """Predict all bodies; forget those that were not seen for long, or are gone before they were proven."""
         now, dt = frame.features.stamp, frame.dt
         for body in list(self.bodies.values()):
-            if now - body.seen_at > _FORGOTTEN or body.missed > RUN * body.seen:
+            if now - body.seen_at > _FORGOTTEN or (body.gone and not body.proven):
                 del self.bodies[body.id]
                 tracks.give_up(np.flatnonzero(tracks.body == body.id))
             else:
@@ -182,22 +183,25 @@ class MovingObjectDetector(ObjectDetector):
 
     def _measure(self, tracks: Tracks, frame: Frame) -> None:
         """Estimate the bodies, and add this frame's measurements to the tracks, in world coordinates."""
-        f = frame.features
         for body in list(self.bodies.values()):
-            mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
-            front = (other for other in self.bodies.values() if other.proven and other.id != body.id)
-            tracks.row[mine[hidden(front, frame.eye, tracks.position[mine])]] = -1
-            belief = located(body, tracks, frame, self._estimator)
-            if belief is None or not self.setup.models.known(belief.estimate):  # it begins anew once measured again
-                body = replace(body, belief=None)
-            else:
-                body = with_belief(body, belief, frame.slot, f.stamp, self.setup.config.min_speed)
-            self.bodies[body.id] = body
+            body = self.bodies[body.id] = self._estimated(body, tracks, frame)
             mine = np.flatnonzero(tracks.body == body.id)
             tracks.position[mine] = transform(body.T, tracks.local[mine])
         for column in (tracks.A, tracks.p, tracks.dof):  # what the slot held leaves the window
             column[:, frame.slot] = 0
         self._record(tracks, np.flatnonzero(tracks.found), frame)
+
+    def _estimated(self, body: Body, tracks: Tracks, frame: Frame) -> Body:
+        """The body after this frame."""
+        slot, stamp = frame.slot, frame.features.stamp
+        T = found_again(body, tracks, frame) if body.gone else None
+        if T is not None:
+            return returned(body, T, slot, stamp)
+        mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
+        front = (b for b in self.bodies.values() if b.proven and not b.gone and b.id != body.id)
+        tracks.row[mine[hidden(front, frame.eye, tracks.position[mine])]] = -1
+        belief = located(body, tracks, frame, self._estimator)
+        return with_belief(body, belief, slot, stamp, self.setup.config.min_speed)
 
     def _record(self, tracks: Tracks, rows: IndexArray, frame: Frame) -> None:
         """Add what tracks (K,) measured in this frame."""
@@ -256,8 +260,9 @@ class MovingObjectDetector(ObjectDetector):
             members = members[tracks.count(members) >= MIN_FRAMES - 1]
             scene = scenes[None if whole is None else whole.id]
             moved, way = finder.moved_in(whole, tracks, members, frame), Way.of(body, frame, whole)
-            evidence, counts = with_frame(body.evidence, moved, scene, way, body.far, both)
-            body = replace(body, evidence=evidence, certain=body.certain + counts)
+            far = body.far or (self.setup.config.size > 0 and body.went > body.across)
+            evidence, counts = with_frame(body.evidence, moved, scene, way, far, both)
+            body = replace(body, evidence=evidence, certain=body.certain + counts, far=far)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= 2 * WINDOW:  # the first holds how it started
                 self._drop(tracks, body)
@@ -274,7 +279,7 @@ class MovingObjectDetector(ObjectDetector):
         for id, body in list(self.bodies.items()):
             if body.belief is None and body.measured:
                 mine = np.flatnonzero((tracks.body == id) & tracks.found)
-                seen = observed(body, tracks, mine, frame.features, body.T)
+                seen = observed(body, tracks, mine, frame.features)
                 belief = self._estimator.updated(None, id, seen, frame.cameras)
                 self.bodies[id] = replace(body, belief=belief, measured_at=frame.features.stamp)
 

@@ -16,15 +16,20 @@ from slam.bodies.track_kernels import inverses
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among
+from slam.geometry.rig import measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.object_data import ObjectObservations
 from slam.tracks import follow as features_of_tracks
+from slam.tracks.follow import match_everywhere
 from slam.tracks.table import Tracks
+from slam.window.consensus import find_consensus
+from slam.window.gating import MIN_CONSENSUS
 
 _SEARCH = 4.0, 25.0  # least and largest half size of the search windows of tracks [px]
 _ALIKE = 0.5, 0.8  # largest descriptor distance, and its largest ratio to the second best
 _UNKNOWN = 1e-6  # numerics: on a member's point that has no information yet [1/m²]
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
+_POSES = 200  # cost: poses of a body that are tried where its place is not known
 _RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
 
 
@@ -34,16 +39,18 @@ def follow(tracks: Tracks, bodies: Mapping[int, Body], frame: Frame) -> None:
     Tracks are looked for where their fit, or their body's motion, says, in windows as wide as that is uncertain; then
     those too young to have a velocity as far off as `max_speed` allows. Members of a body that was not measured in the
     last frame keep their descriptors, which would else become those of what occludes the body, and leave the features
-    that they match to free tracks: they may newly come into view.
+    that they match to free tracks: they may newly come into view. Those of a body that is gone are not looked for here,
+    see `found_again`.
     """
     alive = np.flatnonzero(tracks.number >= 0)
     _advance(tracks, bodies, alive, frame.dt)
     lost = of_bodies(tracks, (body for body in bodies.values() if body.missed > 1))
+    gone = of_bodies(tracks, (body for body in bodies.values() if body.gone))
     taken = among(len(frame.local), tracks.row[tracks.row >= 0])
     _look(tracks, frame, alive[(~lost & (tracks.row < 0))[alive]], taken)
     held = among(len(taken), tracks.row[tracks.found & (tracks.body >= 0) & ~lost])
     _far(tracks, frame, taken)
-    _look(tracks, frame, np.flatnonzero(lost & (tracks.row < 0)), held)
+    _look(tracks, frame, np.flatnonzero(lost & ~gone & (tracks.row < 0)), held)
     tracks.unfound[:] = np.where(tracks.found, 0, tracks.unfound + 1)
     seen = np.flatnonzero(tracks.found & ~lost)
     tracks.look[seen] = frame.features.descriptors[tracks.row[seen]]
@@ -111,8 +118,7 @@ def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) 
     misfits, but followed on: they may lie on a part that moves otherwise, such as a lid.
     """
     mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
-    anywhere = len(mine) < MIN_POINTS and np.trace(body.covariance[3:, 3:]) > body.across**2
-    some = mine[:0] if anywhere else mine  # else any two points agree with one of its poses
+    some = mine[:0] if len(mine) < MIN_POINTS and body.unplaced else mine  # any two points agree with one of its poses
     belief = estimator.updated(body.belief, body.id, observed(body, tracks, some, frame.features), frame.cameras)
     rows = tracks.row[mine]
     tracks.row[mine] = -1
@@ -120,21 +126,46 @@ def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) 
         return belief
     agrees = np.isin(tracks.number[mine], belief.estimate.used)
     tracks.misfit[mine] = np.where(agrees, 0, tracks.misfit[mine] + 1)
-    free = np.flatnonzero((tracks.body < 0) & tracks.found)
-    tracks.give_up(free[np.isin(tracks.row[free], rows[agrees])])
+    _take_from_free(tracks, rows[agrees])
     left = agrees | ~np.isin(rows, tracks.row[tracks.found])
     tracks.row[mine[left]] = rows[left]
     tracks.look[mine[agrees]] = frame.features.descriptors[rows[agrees]]
     return belief
 
 
-def observed(
-    body: Body, tracks: Tracks, mine: IndexArray, features: StereoFeatures, T: Array | None = None
-) -> ObjectObservations:
-    """A body's seen tracks (K,), with a guess of its pose (4, 4) where there is one."""
+def found_again(body: Body, tracks: Tracks, frame: Frame) -> Array | None:
+    """The pose (4, 4) of a body whose place is no longer known, None where it is not seen.
+
+    Its members are recognised by their descriptors, wherever they are. Most of those must agree on one pose of it, and
+    as many as tell it from chance; they have their features then, in place.
+    """
+    s, f = frame.setup, frame.features
+    mine = np.flatnonzero(tracks.body == body.id)
+    free = np.flatnonzero(~among(len(f), tracks.row[tracks.found & (tracks.body >= 0)]))
+    matches = match_everywhere(tracks.look[mine], tracks.laplacian[mine], f.select(free), *_ALIKE)
+    rows, seen = mine[matches.tracks], free[matches.features]
+    z, guess = measurement_rows(f.uv_left[seen], f.uv_right[seen]), inverse(body.T) @ frame.T_world_left
+    found = find_consensus(s.rig, tracks.local[rows], z, guess, SIGMAS * s.sigma, _POSES, 0)
+    if found.inliers.sum() < max(MIN_CONSENSUS, (len(rows) + 1) // 2):
+        return None
+    rows, seen = rows[found.inliers], seen[found.inliers]
+    _take_from_free(tracks, seen)
+    tracks.row[rows], tracks.misfit[rows], tracks.unfound[rows] = seen, 0, 0
+    tracks.look[rows] = f.descriptors[seen]
+    return np.asarray(frame.T_world_left @ inverse(found.T_world_left))
+
+
+def _take_from_free(tracks: Tracks, features: IndexArray) -> None:
+    """Features (K,) are a body's: free tracks that have them are given up, in place."""
+    free = np.flatnonzero((tracks.body < 0) & tracks.found)
+    tracks.give_up(free[np.isin(tracks.row[free], features)])
+
+
+def observed(body: Body, tracks: Tracks, mine: IndexArray, features: StereoFeatures) -> ObjectObservations:
+    """A body's seen tracks (K,), and where it is thought to be."""
     order = mine[np.argsort(tracks.number[mine])]
     rows = tracks.row[order]
     return ObjectObservations(
-        body.id, tracks.number[order], features.uv_left[rows], features.uv_right[rows], T, body.velocity,
+        body.id, tracks.number[order], features.uv_left[rows], features.uv_right[rows], body.T, body.velocity,
         np.sqrt(body.velocity_covariance.diagonal()),
     )  # fmt: skip

@@ -24,7 +24,6 @@ from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
 
 MARGIN = 0.25  # how far from a body's extent its further features may lie, as a share of the extent's diagonal
-_MOST_POINTS = 80  # cost: members of a body
 _OFF = 0.2  # how far a pose may be from a constant velocity, before anything is known [rad] and [m]
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join
 _LOOSE = 4.0  # times the 99 % limit that the χ² of a member may be whose motion is explained for the most part
@@ -155,11 +154,6 @@ def _expel(body: Body, tracks: Tracks) -> Array:
         remove_members(tracks, mine[wrong & ~seen], body)
         tracks.expelled[mine[wrong]] = True
         _release(tracks, mine[wrong & seen])
-        mine = mine[~wrong]
-    if len(mine) > _MOST_POINTS:
-        worth = np.trace(tracks.local_information[mine], axis1=1, axis2=2)
-        order = np.lexsort((worth, -tracks.unfound[mine]))
-        remove_members(tracks, mine[order[: len(mine) - _MOST_POINTS]], body)
     stay = seen & ~wrong
     return gain[stay] - 6.0 * float(body.known.sum()) / max(int(stay.sum()), 1)
 

@@ -40,8 +40,7 @@ from slam.calibration.saved import SavedCalibration, joint_calibration
 from slam.data import CommonError, Estimate, StereoFeatures
 from slam.errors import CalibrationError, ConfigurationError
 from slam.geometry.arrays import changed
-from slam.geometry.rig import StereoRig
-from slam.geometry.rig_numbers import rig_difference, rig_numbers
+from slam.geometry.rig import StereoRig, rig_difference, rig_numbers
 from slam.geometry.se3 import Array, adjoint
 from slam.interfaces import Backend, ConsideringBackend, RevisingBackend
 from slam.tracks.follow import Matches

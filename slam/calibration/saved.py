@@ -18,7 +18,7 @@ from slam.calibration.model import RigModel
 from slam.calibration.posterior import Prior, RigEvidence, RigPosterior, factory_prior, solve
 from slam.errors import CalibrationError
 from slam.files import expanded, read_text, write_text
-from slam.geometry.rig_numbers import NUMBERS, rig_numbers
+from slam.geometry.rig import NUMBERS, rig_numbers
 from slam.geometry.se3 import Array
 
 _LIMIT = 2**24  # bytes of a file: the summary of a run with all its settings is far smaller

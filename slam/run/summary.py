@@ -127,9 +127,9 @@ def results_of(
     singular = _singular(record, final)
     online, steps = path.select(measured), np.diff(path.positions, axis=0)
     noise, doubt = getattr(sequence, "truth_noise", TruthNoise()), ""
-    exact = noise == TruthNoise() and sequence.format != "synthetic"  # the truth is taken as such
-    if sequence.ground_truth is not None and exact and not getattr(system, "doubt", ""):  # else the path tells nothing
-        doubt = truth_doubt(online, sequence.ground_truth)
+    of_camera = sequence.format != "synthetic" and not noise.mounting  # in a file of the camera's own poses
+    if sequence.ground_truth is not None and of_camera and not getattr(system, "doubt", ""):  # else nothing tells it
+        doubt = truth_doubt(online, sequence.ground_truth, noise.translation)
     if doubt:
         logger.warning("%s", doubt)
     speeds = np.linalg.norm(steps, axis=1) / np.diff(path.stamps)

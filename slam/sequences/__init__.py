@@ -28,17 +28,17 @@ from slam.errors import (
 from slam.files import expanded, note_input, reason
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import pair
-from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.geometry.trajectory import Trajectory
 from slam.naming import nearest, unknown
 from slam.query import read_query
 from slam.sequences import euroc, folders, kitti, ros
 from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, logger, read_masks, turned
 from slam.sequences.folders import VIDEO_SUFFIXES
 from slam.sequences.images import IMAGE_SUFFIXES
-from slam.sequences.options import RECORDED, Options
+from slam.sequences.options import RECORDED, Options, truth_noise
 from slam.sequences.tables import require_truth
 
-__all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
+__all__ = ["RecordedSequence", "Sequence", "format_of", "formats", "is_live", "open_sequence", "with_mask"]
 
 _LOOKED_AT = 500  # entries below a folder that is no sequence, at each of so many levels
 _LEVELS = 4
@@ -125,7 +125,7 @@ def _open_folder(text: str, format: str | None, quiet: bool) -> RecordedSequence
         masks = read_masks(options.get("mask"), home, found.rig)
         if "truth" in options:
             given = _truth(home / expanded(options["truth"]), found.stamps, lines)
-            found = replace(found, ground_truth=given, truth_noise=TruthNoise())
+            found = replace(found, ground_truth=given, truth_noise=truth_noise(options.get("truth_sigma", "0")))
         swap = options.get("swap", False)
         options.require_read(f"{folder} is read as {name}")
     for line in () if quiet else lines:
@@ -186,7 +186,8 @@ def _exists(text: str) -> bool:
         return False
 
 
-def _format_of(folder: Path) -> str | None:
+def format_of(folder: Path) -> str | None:
+    """The format of the recording that a folder, or file, looks like; None where it is none."""
     return next((name for name, (matches, _) in _FORMATS.items() if matches(folder)), None)
 
 
@@ -196,8 +197,12 @@ def _format_asked(folder: Path, query: str, text: str) -> str | None:
     if ros.matches_folder(folder):
         return "ros"
     if not folder.exists():
-        what = "file or folder" if folder.suffix else "folder"
-        raise SequenceError(f"{folder}: there is no such {what}{_hint_name(text)}")
+        from slam import worlds
+
+        name, mark, options = text.partition("?")
+        near = nearest(name, worlds.names())
+        hint = f" (did you mean 'synthetic:{near}{mark}{options}'?)" if near else ""
+        raise SequenceError(f"{folder}: there is no such {'file or folder' if folder.suffix else 'folder'}{hint}")
     if not folder.is_dir() and "layout" not in named:
         hint = "; give the folder that holds both cameras' images, unpacked"
         if folder.suffix.lower() in VIDEO_SUFFIXES:
@@ -206,16 +211,7 @@ def _format_asked(folder: Path, query: str, text: str) -> str | None:
         raise SequenceError(f"{folder}: a file where the sequence's folder should be{hint}")
     if folder.is_dir() and not any(folder.iterdir()):
         raise SequenceError(f"{folder}: the folder is empty")
-    return "folders" if named & {"left", "right", "layout"} else _format_of(folder)
-
-
-def _hint_name(text: str) -> str:
-    """A world with a similar name than what was asked for."""
-    from slam import worlds
-
-    name, mark, query = text.partition("?")
-    near = nearest(name, worlds.names())
-    return f" (did you mean 'synthetic:{near}{mark}{query}'?)" if near else ""
+    return "folders" if named & {"left", "right", "layout"} else format_of(folder)
 
 
 def _hint_near(folder: Path) -> str:
@@ -223,7 +219,7 @@ def _hint_near(folder: Path) -> str:
     with suppress(OSError, SequenceError):
         for level in range(1, _LEVELS + 1):  # 2011_09_26/…_sync, dataset/sequences/03
             inside = islice(folder.glob("/".join("*" * level)), _LOOKED_AT)
-            below = sorted(str(path.relative_to(folder)) for path in inside if _format_of(path))
+            below = sorted(str(path.relative_to(folder)) for path in inside if format_of(path))
             if len(below) == 1:
                 return f"; below it is {below[0]}: give that"
             if below:
@@ -231,7 +227,7 @@ def _hint_near(folder: Path) -> str:
                 return f"; below it are {', '.join(below[:_LISTED])}{more}: give one of them"
     images = any(path.suffix.lower() in IMAGE_SUFFIXES for path in islice(folder.iterdir(), _LOOKED_AT))
     for parent in islice(folder.parents, _LEVELS):  # mav0/cam0/data
-        if (name := _format_of(parent)) is not None and (images or name != "folders"):
+        if (name := format_of(parent)) is not None and (images or name != "folders"):
             return f"; it is a part of one: give {parent} (format {name})"
     if images:
         return f"; where each image holds both cameras: '{folder.name}?layout=sbs'; else name both: ?left=…&right=…"

@@ -175,8 +175,12 @@ def turned(vectors: Array, bodies: IdArray, T_world_body: Array) -> Array:
 
 def hidden(centre: Array, points: Array, occluders: RectangleArrays) -> BoolArray:
     """Which points (P, 3) an occluder's front hides from a camera at `centre` (3,), all in world coordinates."""
-    chosen = occluders.select(np.flatnonzero((occluders.normal * (occluders.origin - centre)).sum(axis=1) < -1e-9))
-    rays, offset = points - centre, chosen.origin - centre
+    rays, may = points - centre, (occluders.normal * (occluders.origin - centre)).sum(axis=1) < -1e-9
+    ahead = rays.sum(axis=0)
+    if (rays @ ahead > 0).all():  # then what is wholly behind hides nothing
+        may &= (occluders.middle - centre) @ ahead >= -occluders.radius * np.linalg.norm(ahead)
+    chosen = occluders.select(np.flatnonzero(may))
+    offset = chosen.origin - centre
     along, down = (edge / (edge**2).sum(axis=1, keepdims=True) for edge in (chosen.along, chosen.down))
     height = (chosen.normal * offset).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -46,6 +46,18 @@ def test_the_box_is_found_once_and_followed_and_little_else_is_said_to_move(box_
         assert not np.isin(result.added_features, result.moving_features).any()
 
 
+def test_a_box_that_is_hidden_for_two_seconds_keeps_its_id():
+    """It moves when it is hidden, and rests when it comes back, where nothing predicted it."""
+    sequence = slam.open_sequence("synthetic:box?density=300&camera=moving&sigma=0.3")
+    system, ids = system_for(sequence), {True: set(), False: set()}
+    for k in range(50, 150):
+        seen, hidden = sequence.simulate(k), 85 <= k < 145
+        features = seen.features.select(seen.objects == 0) if hidden else seen.features
+        ids[k < 145] |= {body.id for body in system.process_features(features).objects if body.estimate.measured}
+    assert len(ids[True]) == 1
+    assert ids[False] == ids[True]
+
+
 def test_landmarks_on_what_may_be_a_body_do_not_measure_the_camera():
     """From the group's first suspicion until the body is proven, and its landmarks leave the map."""
     sequence = slam.open_sequence("synthetic:box?density=300")

@@ -16,7 +16,7 @@ from tests.slam.bodies.test_recovery import POINTS, begin, frame_of, scene
 def test_a_body_that_was_not_measured_has_no_claim_to_features(missed, by_both):
     body, tracks, features, truth = scene(4, np.zeros(6), np.random.default_rng(3))
     members = np.flatnonzero(tracks.body == body.id)
-    free = begin(tracks, features, np.arange(4), transform(truth, POINTS))
+    free = begin(tracks, features, np.arange(4), transform(truth, POINTS[:4]))
     tracks.row[:] = -1
     follow(tracks, {1: replace(body, missed=missed)}, frame_of(features, 25.0))
     assert (np.sort(np.append(tracks.row[members], tracks.row[free])) >= 0).sum() == (8 if by_both else 4)
@@ -40,7 +40,7 @@ def test_landmarks_that_were_found_keep_their_features_wherever_they_were_expect
     """Also members of a body that is lost."""
     body, tracks, features, truth = scene(4, np.zeros(6), np.random.default_rng(3))
     members = np.flatnonzero(tracks.body == body.id)
-    free = begin(tracks, features, np.arange(4), transform(truth, POINTS))
+    free = begin(tracks, features, np.arange(4), transform(truth, POINTS[:4]))
     tracks.row[:] = -1
     tracks.set_features(np.array([free[0], free[1], members[2]]), np.array([1, 0, 3]))
     follow(tracks, {1: replace(body, missed=2)}, frame_of(features, 25.0))

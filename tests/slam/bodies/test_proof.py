@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 
 from slam.bodies.bodies import new_body
+from slam.bodies.config import ObjectsConfig
+from slam.bodies.detector import MovingObjectDetector
 from slam.bodies.finder import Displacements, Scene
 from slam.bodies.proof import PROVEN, Way, with_frame
 from slam.geometry.se3 import exp, points_by_pose
+from tests.slam.bodies.test_recovery import MODELS, RIG, frame_of
+from tests.slam.bodies.test_recovery import scene as body_of_points
 
 WINDOW, NONE = 12, np.zeros(3)
 ENDS = np.concatenate([np.zeros((1, 3)), 0.3 * np.eye(3)])
@@ -140,3 +144,14 @@ def test_a_part_must_go_a_way_of_its_own_in_its_whole(alike):
     own = Way.of(bodies[1], frame, bodies[0]).places
     assert (np.ptp(own, axis=0).max() < 1e-9) == alike
     assert np.ptp(Way.of(bodies[1], frame, None).places, axis=0).max() > 1.0
+
+
+@pytest.mark.parametrize(("size", "went", "far"), [(2.0, 3.0, True), (2.0, 1.5, False), (0.0, 3.0, False)])
+def test_a_body_that_went_farther_than_it_is_wide_on_a_drive_is_followed_for_far(size, went, far):
+    body, tracks, features, _ = body_of_points(4, np.zeros(6), np.random.default_rng(0))
+    T = body.T.copy()
+    T[2, 3] += went
+    detector = MovingObjectDetector(RIG, ObjectsConfig(size=size), MODELS)
+    detector.bodies = {1: replace(body, T=T)}
+    detector._prove(tracks, frame_of(features), {None: scene()})
+    assert detector.bodies[1].far == far

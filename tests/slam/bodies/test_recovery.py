@@ -11,7 +11,7 @@ from slam.bodies import membership
 from slam.bodies.bodies import new_body, with_extent
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.estimator import BodyEstimator
-from slam.bodies.following import located
+from slam.bodies.following import found_again, located
 from slam.bodies.frame import Frame, Setup
 from slam.data import RecentPoses, StereoFeatures
 from slam.geometry.rig import StereoRig
@@ -25,7 +25,9 @@ WINDOW = 12
 MODELS = models_for("driving")
 ESTIMATOR = BodyEstimator(RIG, MODELS)
 CAMERAS = RecentPoses(np.array([-0.1, 0.0]), np.tile(np.eye(4), (2, 1, 1)), 1e-10 * np.eye(12))
-POINTS = np.array([[0.3, 0.0, 0.0], [-0.3, 0.4, 0.1], [0.0, -0.6, 0.2], [0.2, 0.5, -0.1]])
+POINTS = np.array(
+    [[0.3, 0.0, 0.0], [-0.3, 0.4, 0.1], [0.0, -0.6, 0.2], [0.2, 0.5, -0.1], [0.5, -0.3, 0.4], [-0.5, -0.2, -0.3]]
+)
 
 
 def scene(seen, off, rng, deviation=0.5):
@@ -49,7 +51,7 @@ def scene(seen, off, rng, deviation=0.5):
     membership.add_members(body, tracks, rows)
     tracks.local[rows], tracks.local_information[rows] = POINTS[:seen], 1e4 * np.eye(3)
     before = ObjectObservations(
-        1, np.arange(4), *RIG.project(transform(T, POINTS)), T, np.zeros(6), np.repeat([0.5, 10 * deviation], 3)
+        1, np.arange(6), *RIG.project(transform(T, POINTS)), T, np.zeros(6), np.repeat([0.5, 10 * deviation], 3)
     )
     first = RecentPoses(np.array([-0.1]), np.eye(4)[None], 1e-10 * np.eye(6))
     body = replace(body, belief=ESTIMATOR.updated(None, 1, before, first))
@@ -95,6 +97,24 @@ def test_points_that_do_not_agree_or_are_too_few_say_nothing():
     assert place(body, tracks, features) is None
     body, tracks, features, _ = scene(2, np.zeros(6), np.random.default_rng(6), deviation=2.0)
     assert place(body, tracks, features) is None
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 3])
+def test_a_body_that_may_be_anywhere_is_recognised_if_most_of_its_points_agree(wrong):
+    """It has gone and turned where nobody looked; some descriptors are those of other points."""
+    off = np.array([0.1, 0.5, -0.2, -3.0, 0.5, 4.0])
+    body, tracks, features, truth = scene(6, off, np.random.default_rng(7))
+    features.descriptors[:wrong] = np.roll(features.descriptors[:wrong], 1, axis=0)
+    if wrong == 1:
+        features.descriptors[0] = np.ones(64) / 8.0
+    tracks.row[:] = -1
+    T = found_again(body, tracks, frame_of(features))
+    if wrong == 3:  # of six
+        assert T is None and (tracks.row < 0).all()
+        return
+    assert np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.1
+    assert np.degrees(np.arccos((np.trace(T[:3, :3].T @ truth[:3, :3]) - 1) / 2)) < 2.0
+    assert tracks.row[wrong:6].tolist() == list(range(wrong, 6))
 
 
 def test_a_point_that_disagrees_is_followed_on_and_counted():

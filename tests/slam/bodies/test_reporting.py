@@ -1,4 +1,4 @@
-"""What is reported of bodies that are not measured, and what becomes of those of which nothing is known any more."""
+"""What is reported of bodies that are not measured."""
 
 from __future__ import annotations
 
@@ -46,24 +46,3 @@ def test_a_body_out_of_view_is_reported_for_a_short_while_only(moving_box):
     assert all(not thing.estimate.measured and thing.measured_at == last for thing in after)
     sure = [rows[-1].existence, *(thing.existence for thing in after)]
     assert (np.diff(sure) < 0).all() and sure[-1] > 0.5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("first", [46, 48, 50, 54, 56])  # from 52 on it is found too late for this
-def test_a_body_whose_covariance_has_run_away_is_not_reported_and_starts_anew(moving_box, monkeypatch, first):
-    """Under its id, in one of the next two frames; in single frames too few of its features are found.
-
-    In one of these runs a second body is found on a part of the box afterwards: no more than one.
-    """
-    step, detector = moving_box
-    ids, at = set(), first
-    while not ids or at < GONE - 13:
-        ids, at = ids | {thing.id for thing in step(at).objects}, at + 1
-    with monkeypatch.context() as patch:
-        patch.setattr(type(detector.setup.models), "known", lambda *_: False)
-        assert not step(at).objects
-        assert all(body.belief is None for body in detector.bodies.values())
-    after = [step(k).objects for k in range(at + 1, at + 7)]
-    later = [{thing.id for thing in things} for things in after]
-    assert len(ids) == 1 and ids & (later[0] | later[1]) and len(ids.union(*later)) <= 2
-    assert min(thing.found_at for things in after for thing in things) > 0

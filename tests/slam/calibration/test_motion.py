@@ -45,11 +45,11 @@ def test_a_pair_without_noise_gives_the_truth():
     np.testing.assert_allclose(far @ mean, far @ theta, atol=0.06)  # of up to 2 px
 
 
-def distant_views(apart=40.0):
+def distant_views():
     """Two views along the road, the true motion between them, and the street."""
     street = Street(3, count=20000, length=200)
-    poses = [np.eye(4), se3.exp(np.array([0, 0.1, 0, 0, 0, apart]))]
-    poses[1][:3, 3] = [2.0, 0.0, apart]
+    poses = [np.eye(4), se3.exp(np.array([0, 0.1, 0, 0, 0, 40]))]
+    poses[1][:3, 3] = [2.0, 0.0, 40.0]
     every = [street.features(float(k), T, most=8000, noise=0.2) for k, T in enumerate(poses)]
     return poses, every
 

@@ -12,6 +12,7 @@ import pytest
 
 import slam
 from slam.errors import CalibrationError, ConfigurationError, SequenceError, SlamError
+from slam.geometry.trajectory import TruthNoise
 from slam.sequences import open_sequence, with_mask
 from slam.worlds import open_world
 from tests import recordings
@@ -294,6 +295,15 @@ def test_a_true_path_is_given_by_an_option(two_folders: Path) -> None:
     truth.write_tum(two_folders / "true.txt")
     found = open_sequence(f"{two_folders}?truth=true.txt").ground_truth
     np.testing.assert_allclose(found.poses, truth.poses, atol=1e-8)
+    assert open_sequence(f"{two_folders}?truth=true.txt").truth_noise == TruthNoise()
+    noise = open_sequence(f"{two_folders}?truth=true.txt&truth_sigma=0.002,0.2").truth_noise
+    assert noise == TruthNoise(rotation=np.radians(0.2), translation=0.002)
+    for query, said in (
+        ("truth=true.txt&truth_sigma=2mm", "truth_sigma in metres"),
+        ("truth_sigma=0.1", "does nothing"),
+    ):
+        with pytest.raises(ConfigurationError, match=said):
+            open_sequence(f"{two_folders}?{query}")
     slam.Trajectory(stamps * 1e3, truth.poses).write_tum(two_folders / "ms.txt")
     (said,) = open_sequence(f"{two_folders}?truth=ms.txt").warnings[-1:]
     assert f"1 of {len(stamps)} images have a true pose" in said
