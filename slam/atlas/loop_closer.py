@@ -65,8 +65,8 @@ class LoopCloser:
         wanted = begins or (not step.tracking.unmeasured and self._is_keyframe(atlas, step))
         if not (self._enabled and wanted):
             return atlas
-        landmark_of = step.matches.landmark_of(len(step.features))
-        landmark_of[step.added.rows] = step.added.ids
+        seen, landmark_of = step.matches.joined(step.added), np.full(len(step.features), -1)
+        landmark_of[seen.rows] = seen.ids
         new = self._keyframe(atlas, step, landmark_of)
         if new is None:
             return atlas
