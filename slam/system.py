@@ -11,7 +11,6 @@ import numpy as np
 from slam import registry
 from slam.atlas.atlas import Atlas
 from slam.atlas.map_io import FIRST_FRAME, SavedMap
-from slam.bodies.config import ObjectsConfig
 from slam.bodies.detector import MovingObjectDetector, ObjectDetector
 from slam.calibration import SavedCalibration, SelfCalibration
 from slam.config import SystemConfig
@@ -26,7 +25,6 @@ from slam.input.features import Rectification, documented, following
 from slam.input.moment import MomentWatch
 from slam.input.warnings import REPEATED
 from slam.interfaces import Backend, Frontend
-from slam.models import EstimatorModels
 from slam.naming import count
 from slam.papers.procedure1 import Procedure1Detector
 from slam.runtime.compilation import Stages
@@ -120,7 +118,8 @@ class StereoSlam:
         self.world_frame = FIRST_FRAME if prior_map is None else prior_map.world_frame
         inside.require_fits(first)
         self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
-        detector, restarts = _detector_for(inside.rig, c.objects, inner.models), names[1] is not None
+        kinds = {"off": lambda *_: ObjectDetector(), "detect": MovingObjectDetector, "procedure1": Procedure1Detector}
+        detector, restarts = kinds[c.objects.mode](inside.rig, c.objects, inner.models), names[1] is not None
         self._tracker = Tracker(inside.rig, inner, self.calibration, first, restarts, detector, self.frontend)
         self._session = Session(self._tracker, names[1])
         self._stages = Stages()
@@ -362,9 +361,3 @@ class StereoSlam:
         """State for copying and pickling; refused while another thread is in a step."""
         with self._stepping:
             return vars(self).copy()
-
-
-def _detector_for(rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> ObjectDetector:
-    """The detector of the configured mode; raises ConfigurationError where its database cannot be read."""
-    detectors = {"detect": MovingObjectDetector, "procedure1": Procedure1Detector}
-    return ObjectDetector() if config.mode == "off" else detectors[config.mode](rig, config, models)

@@ -65,8 +65,8 @@ class LoopCloser:
         wanted = begins or (not step.tracking.unmeasured and self._is_keyframe(atlas, step))
         if not (self._enabled and wanted):
             return atlas
-        landmark_of = step.matches.landmark_of(len(step.features))
-        landmark_of[step.added.rows] = step.added.ids
+        seen, landmark_of = step.matches.joined(step.added), np.full(len(step.features), -1)
+        landmark_of[seen.rows] = seen.ids
         new = self._keyframe(atlas, step, landmark_of)
         if new is None:
             return atlas
@@ -96,9 +96,11 @@ class LoopCloser:
         if not verified:
             return None
         loop = max(verified, key=lambda loop: loop.inliers)
-        if any(2 * other.inliers > loop.inliers and not self._same_place(atlas, loop, other) for other in verified):
-            return None
         keyframe = atlas.keyframes[loop.first].corrected(correction, self._rig)
+        at = np.array([(atlas.poses_in_map[x.first] @ x.T_first_second)[:3, 3] for x in (loop, *verified)])
+        elsewhere = np.linalg.norm(at[1:] - at[0], axis=1) >= keyframe.depth  # than the scene is deep
+        if any(2 * x.inliers > loop.inliers for x, far in zip(verified, elsewhere.tolist()) if far):
+            return None
         T, points = inverse(atlas.T_map_odom) @ atlas.poses_in_map[loop.first], keyframe.points.astype(float)
         P = T[:3, :3] @ self._rig.triangulation_covariance(points, self._sigma) @ T[:3, :3].T
         landmarks = replace(keyframe_landmarks(keyframe), seen_from=np.tile(T[:3, 3], (len(points), 1)))
@@ -215,11 +217,6 @@ class LoopCloser:
             keyframe, pair = atlas.keyframes[k].corrected(correction, self._rig), (k, len(atlas) - 1)
             found.append(verify(keyframe, features, pair, self._rig, self._localizer, seed))
         return [loop for loop in found if loop is not None]
-
-    def _same_place(self, atlas: Atlas, one: Loop, other: Loop) -> bool:
-        """Whether two verified loops put the camera at positions closer together than the scene's depth."""
-        T, U = (atlas.poses_in_map[loop.first] @ loop.T_first_second for loop in (one, other))
-        return bool(np.linalg.norm(T[:3, 3] - U[:3, 3]) < atlas.keyframes[one.first].depth)
 
 
 def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig) -> bool:

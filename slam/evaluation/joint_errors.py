@@ -40,7 +40,7 @@ class JointErrors:
     @classmethod
     def of(cls, blocks: Sequence[Array], frames: NDArray[np.intp]) -> JointErrors | None:
         """By covariances (K, 6, 6), for each frame, of the last K poses' errors with its own, which comes last."""
-        if not blocks or not all(map(len, blocks)):  # a back end that tells none, or a path without
+        if not any(map(len, blocks)):  # a back end that tells none, or a path without poses
             return None
         by_lag = np.full((len(blocks), max(map(len, blocks)), _DOF, _DOF), np.nan)
         for k, its in enumerate(blocks):
@@ -56,27 +56,30 @@ class JointErrors:
 
         NaN where the back end had no pose before some frame between them, as after it has begun anew.
         """
-        order = np.lexsort((self.frames[last], self.frames[first]))
-        first, last = self.frames[first][order], self.frames[last][order]
-        F, K = self.by_lag.shape[:2]
-        out = np.full((len(first), _DOF, _DOF), np.nan)
-        carried = np.full((len(first), K, _DOF, _DOF), np.nan)  # of the last K frames' errors with those of `first`
+        begun, column = np.unique(self.frames[first], return_inverse=True)
+        last, (F, K) = self.frames[last], self.by_lag.shape[:2]
+        ended = np.zeros(len(begun), np.intp)
+        np.maximum.at(ended, column, last)
+        out = np.full((len(last), _DOF, _DOF), np.nan)
+        carried = np.full((len(begun), K, _DOF, _DOF), np.nan)  # of the last K frames' errors with those of `begun`
         for k in range(F):
-            on = np.flatnonzero((first <= k) & (k <= last))
-            lag = k - first[on]
+            on = np.flatnonzero((begun <= k) & (k <= ended))
+            lag = k - begun[on]
             now = (self.gains[k] @ carried[on, :-1].reshape(-1, (K - 1) * _DOF, _DOF)).reshape(-1, _DOF, _DOF)
             near = lag < K
-            known = self.by_lag[k, lag[near]]
-            now[near] = known
+            now[near] = self.by_lag[k, lag[near]]
             carried[on, 1:], carried[on, 0] = carried[on, :-1], now
-            ends = last[on] == k
-            out[order[on[ends]]] = now[ends]
+            ends = np.flatnonzero(last == k)
+            out[ends] = carried[column[ends], 0]
         return out
 
 
 def _gains(by_lag: Array, k: int, n: int) -> Array:
     """Of frame k's error by those of the n frames before it (6, 6 (K - 1)), 0 by others; NaN of no frame."""
     K, size = by_lag.shape[1], n * _DOF
+    unknown = np.full((_DOF, (K - 1) * _DOF), np.nan)
+    if n < 1:
+        return unknown
     gains = np.zeros((_DOF, K - 1, _DOF))
     P = np.empty((n, _DOF, n, _DOF))
     for i in range(n):
@@ -85,9 +88,9 @@ def _gains(by_lag: Array, k: int, n: int) -> Array:
             P[j, :, i] = P[i, :, j].T
     with_it = by_lag[k, 1 : n + 1].transpose(1, 0, 2).reshape(_DOF, size)
     sigma = np.sqrt(np.diag(P.reshape(size, size)))
+    if not np.isfinite(P).all() or not sigma.all():  # not known, or certain, as a first pose may be
+        return unknown
     correlations = P.reshape(size, size) / np.outer(sigma, sigma)
-    if not n or not np.isfinite(correlations).all():
-        return np.full((_DOF, (K - 1) * _DOF), np.nan)
     values, axes = np.linalg.eigh(correlations)  # some are negative where an estimate forgot what it had known
     inverse = np.divide(1.0, values, out=np.zeros(size), where=values > _NOTHING)
     gains[:, :n] = ((with_it / sigma) @ (axes * inverse) @ axes.T / sigma).reshape(_DOF, n, _DOF)

@@ -71,12 +71,12 @@ def take_patches(
 
     Raises SlamError where the front end returns no patches, or not one for each landmark.
     """
-    at = np.flatnonzero(landmarks.ids >= 0)
-    at = at[isin(landmarks.ids[at], seen.ids)]
-    at = at[~landmarks.has_patch(at)]
+    seen = seen.select(isin(seen.ids, landmarks.ids))
+    at = landmarks.rows(seen.ids)
+    new = ~landmarks.has_patch(at)
+    at, rows, sizes = at[new], seen.rows[new], {"n": int(new.sum())}
     if features.images is None or not len(at):
         return
-    rows, sizes = seen.rows_of(landmarks.ids[at]), {"n": len(at)}
     one = next((patch for patch in landmarks.patches.tolist() if patch is not None), None)
     if one is not None:
         sizes["s"] = len(one.image)

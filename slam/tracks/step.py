@@ -133,17 +133,6 @@ class LandmarkMatches:
         """Some of the landmarks (a mask or indices)."""
         return LandmarkMatches(self.ids[rows], self.rows[rows], self.T_world_left, doubted=self.doubted)
 
-    def rows_of(self, ids: IdArray) -> NDArray[np.intp]:
-        """Rows of the features that show landmarks, by their ids, all of which were found."""
-        order = np.argsort(self.ids, kind="stable")
-        return self.rows[order[np.searchsorted(self.ids, ids, sorter=order)]]
-
-    def landmark_of(self, features: int) -> IdArray:
-        """Id of the landmark matched with each of N = `features` features (N,), −1 for none."""
-        ids = np.full(features, -1, np.int64)
-        ids[self.rows] = self.ids
-        return ids
-
     def observations(self, features: StereoFeatures) -> Observations:
         """The landmarks with the pixels of the features that they were matched with."""
         return Observations(self.ids, features.uv_left[self.rows], features.uv_right[self.rows])
