@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from slam.checks import LATEST_STAMP, is_rigid
-from slam.data import Estimate, Patches, Prediction, UpdateReport, UpdateStatus
+from slam.data import Estimate, Patches, Prediction, RecentPoses, UpdateReport, UpdateStatus
 from slam.errors import AnswerError, PartError, SlamError, cause
+from slam.interfaces import Backend, RecentBackend
 
 _OURS = ("slam", "backends", "frontends", "builtins")
 
-#: What each method answers: a type, and the types or shapes of its attributes. Equal letters stand for equal numbers.
+#: What each method answers: a type, and the types or shapes of its attributes. Equal letters stand for equal numbers,
+#: and one after a 6 for six times its number.
 _POSE = {"stamp": Real, "T_world_left": (4, 4), "covariance": (6, 6), "ids": ("n",)}
 _PIXELS = {"uv_left": ("n", 2), "uv_right": ("n", 2), "innovation": ("n", 2, 2)}
 _REPORT = {"status": UpdateStatus, "reason": str, "used": ("k",), "rejected": ("r",), "nis": Real, "dof": Real}
@@ -24,11 +26,13 @@ _ANSWERS: dict[str, tuple[type, dict[str, Any]]] = {
     "predict": (Prediction, {**_POSE, **_PIXELS}),
     "update": (UpdateReport, _REPORT),
     "estimate": (Estimate, {**_POSE, "positions": ("n", 3), "covariances": ("n", 3, 3)}),
+    "recent": (RecentPoses, {"stamps": ("k",), "poses": ("k", 4, 4), "covariance": ("6k", "6k")}),
     "positions": (np.ndarray, {"real": ("n", 3)}),
     "patches": (Patches, {"images": ("n", "s", "s"), "centres": ("n", 2), "size": ("n",)}),
     "align": (tuple, {}),
 }
-_IDS, _FINITE = ("ids", "used", "rejected"), ("T_world_left", "covariance", "positions", "covariances", "real")
+_IDS, _POSES = ("ids", "used", "rejected"), ("T_world_left", "poses")
+_FINITE = (*_POSES, "stamps", "covariance", "positions", "covariances", "real")
 _COVARIANCES = ("covariance", "covariances", "innovation")
 
 
@@ -49,6 +53,7 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
                 for letter, size in zip(wanted, shape):
                     if isinstance(letter, str):
                         sizes.setdefault(letter, size)
+                        sizes.setdefault(f"6{letter}", 6 * size)
             expected = tuple(map(sizes.get, wanted, wanted))
             if not numeric or shape != expected:
                 got = f"{value.dtype} {shape}" if isinstance(value, np.ndarray) else type(value).__name__
@@ -57,7 +62,7 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
                 raise AnswerError(f"{where} must be an array of ids, got {value.dtype}")
             if name in _FINITE and not np.isfinite(value).all():
                 raise AnswerError(f"{where} is not finite")
-            if name == "T_world_left" and not is_rigid(value, 1e-3):
+            if name in _POSES and not all(is_rigid(T, 1e-3) for T in value.reshape(-1, 4, 4)):
                 raise AnswerError(f"{where} is no rotation and translation")
             if name in _COVARIANCES and (value.diagonal(0, -2, -1) < -1e-9).any():  # 1e-9: rounding
                 raise AnswerError(f"{where} has a negative variance")
@@ -66,6 +71,11 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
         elif name == "stamp" and not abs(value) <= LATEST_STAMP:
             raise AnswerError(f"{where} must be within {LATEST_STAMP:g} s")
     return answer
+
+
+def recent_of(backend: Backend, n: int) -> RecentPoses | None:
+    """The last poses of a back end, at most n, checked; None of one that does not tell them."""
+    return checked(backend, "recent", backend.recent(n)) if isinstance(backend, RecentBackend) else None
 
 
 @contextmanager

@@ -36,9 +36,9 @@ from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
 from slam.input.warnings import REPEATED
-from slam.interfaces import AligningFrontend, Backend, Frontend, MapBackend, RecentBackend, RestingBackend
+from slam.interfaces import AligningFrontend, Backend, Frontend, MapBackend, RestingBackend
 from slam.object_data import MovingObject
-from slam.third_party import checked
+from slam.third_party import checked, recent_of
 from slam.tracks.alignment import align, take_patches
 from slam.tracks.localizer import Localizer, Search, median_deviation
 from slam.tracks.mapper import Mapper
@@ -224,7 +224,7 @@ class Tracker:
         """The camera's pose after an update; the rig's calibration learns from the frame."""
         self.calibration.observe(changed(step.measured, images=None), step.pose)
         estimate: Estimate = checked(state.backend, "estimate", state.backend.estimate(landmarks=False))
-        recent = state.backend.recent(FRAMES + 1) if isinstance(state.backend, RecentBackend) else None
+        recent = recent_of(state.backend, FRAMES + 1)
         return changed(step, estimate=estimate, recent=recent)
 
     def classify(self, state: State, step: Step) -> Step:

@@ -14,9 +14,9 @@ from slam.bodies.estimator import FRAMES
 from slam.data import FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
 from slam.geometry.rig import MINIMAL_POINTS, measurement_rows
 from slam.input.features import Rectification
-from slam.interfaces import Backend, RecentBackend, RevisingBackend
+from slam.interfaces import Backend, RevisingBackend
 from slam.run.recording import RecordedFrame, Recording
-from slam.third_party import checked, named_failures
+from slam.third_party import checked, named_failures, recent_of
 from slam.tracks.config import AssociationConfig
 from slam.window.consensus import find_consensus
 
@@ -91,7 +91,7 @@ def _step(
         backend.remove(frame.removed[at_once])
     times.append(time.perf_counter())
     estimate = checked(backend, "estimate", backend.estimate(landmarks=False))
-    recent = backend.recent(FRAMES + 1) if isinstance(backend, RecentBackend) else None
+    recent = recent_of(backend, FRAMES + 1)
     times.append(time.perf_counter())
     status, reason = _status(report, begins=not size and len(added) > 0)
     count, every = len(seen), len(seen) + len(frame.added)

@@ -10,7 +10,7 @@ import pytest
 
 import frontends.surf
 from frontends.surf import Keypoints, Surf
-from slam.errors import SequenceError
+from slam.errors import ConfigurationError, SequenceError
 from tests.frontends.test_surf import IMAGE
 
 
@@ -63,3 +63,21 @@ def test_the_arguments_and_defaults_are_opencv_s():
     assert got == (400.0, 3, 2, False, True)
     assert isinstance(surf, Surf) and surf.descriptorSize() == 64
     assert surf.defaultNorm() == cv2.SIFT_create().defaultNorm()
+
+
+def test_setters_change_what_is_found_and_refuse_what_this_surf_does_not_have():
+    surf = frontends.surf.create()
+    for name, value, wrong in (
+        ("HessianThreshold", 5000, -1),
+        ("NOctaves", 2, 5),
+        ("NOctaveLayers", 2, 4),
+        ("Upright", True, "no"),
+        ("Extended", False, True),
+    ):
+        getattr(surf, f"set{name}")(value)
+        with pytest.raises(ConfigurationError):
+            getattr(surf, f"set{name}")(wrong)
+        assert getattr(surf, f"get{name}")() == value
+    keypoints, descriptors = surf.detectAndCompute(IMAGE, None)
+    other, expected = Surf(5000, 2, 2).detectAndCompute(IMAGE)
+    assert len(keypoints) == len(other) > 0 and np.array_equal(descriptors, expected)

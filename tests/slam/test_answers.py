@@ -41,6 +41,9 @@ ANSWERS = [
     ("update", lambda r: replace(r, used=r.used.astype(float)), "update: used must be an array"),
     ("estimate", lambda e: replace(e, stamp=np.nan), "estimate: stamp must be within"),
     ("estimate", lambda e: replace(e, covariance=-np.eye(6)), "estimate: covariance has a negative variance"),
+    ("recent", lambda r: [r], "recent: must be of type RecentPoses, got list"),
+    ("recent", lambda r: replace(r, covariance=np.eye(5)), r"recent: covariance must be an array \(6, 6\)"),
+    ("recent", lambda r: replace(r, poses=0 * r.poses), "recent: poses is no rotation"),
     ("positions", lambda x: x[:-1] if len(x) else None, "positions:? must be (of type|an) (ndarray|array)"),
 ]
 

@@ -182,6 +182,13 @@ def test_where_nothing_is_known_the_camera_stays_lost_and_the_map_as_it_is(backe
     assert len(system.trajectory()) == 0
 
 
+def test_there_is_no_map_before_the_first_frame_and_an_empty_one_is_refused():
+    with pytest.raises(SlamError, match="no map yet"):
+        StereoSlam(RIG, None, "ekf").snapshot()
+    with pytest.raises(SlamError, match="holds no landmarks"):
+        StereoSlam(RIG, None, "ekf", prior_map=some_map(0))
+
+
 def test_descriptors_of_another_kind_are_refused():
     known = first_run("ekf").snapshot()
     system = StereoSlam(RIG, None, "ekf", config=CONFIG, prior_map=known)

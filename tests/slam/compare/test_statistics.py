@@ -38,7 +38,8 @@ def test_verdicts():
 
 
 def test_the_interval_of_a_mean():
-    d = difference(ATE, np.zeros(3), np.array([1.0, 2.0, 4.0]))
+    d = difference(ATE, np.array([0.0, 0.0, np.nan, 0.0, 0.0]), np.array([1.0, 2.0, 3.0, np.nan, 4.0]))
+    assert (d.pairs, d.missing) == (3, 2)
     assert (d.low, d.high) == pytest.approx((-1.4612, 6.1279), abs=1e-4)  # 7/3 ± 4.3027 · 0.8819
     assert reach(6, 20) == pytest.approx(5.60386 / np.sqrt(6), rel=1e-4)  # Student's at 1 − 0.05 / 40
     assert reach(1) == np.inf

@@ -37,6 +37,10 @@ def test_a_rig_with_lenses_gives_what_its_rectified_pair_gives():
         P, J = A @ other.estimate.covariance @ A.T, A @ other.common.jacobian
         np.testing.assert_allclose(result.estimate.covariance, P, atol=1e-12 * np.trace(P))
         np.testing.assert_allclose(result.common.jacobian, J, atol=1e-12)
+        n, recent = len(other.recent), result.recent
+        np.testing.assert_allclose(recent.poses @ X, other.recent.poses, atol=1e-12)
+        P = np.kron(np.eye(n), A) @ other.recent.covariance @ np.kron(np.eye(n), A).T
+        np.testing.assert_allclose(recent.covariance, P, atol=1e-12 * np.trace(P))
     np.testing.assert_allclose(system.trajectory().poses @ X, inside.trajectory().poses, atol=1e-12)
     np.testing.assert_allclose(system.estimate().positions, inside.estimate().positions, atol=1e-12)
 

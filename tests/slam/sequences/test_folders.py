@@ -229,6 +229,13 @@ def test_masks_are_of_both_cameras_or_of_one(tmp_path: Path, two_folders: Path) 
         with_mask("synthetic:desk?frames=3", f"{tmp_path / 'left half.png'},{tmp_path / 'all.png'}")
     )
     frame = sequence[2]
+    cv2.imwrite(str(tmp_path / "black.png"), 0 * mask)
+    for wrong, said in (
+        (with_mask("synthetic:desk?frames=3", str(tmp_path / "black.png")), "black all over"),
+        (f"{two_folders}?mask={tmp_path / 'all.png'}", "another size"),
+    ):
+        with pytest.raises(ConfigurationError, match=said):
+            open_sequence(wrong)
     with pytest.raises(ConfigurationError, match="mask"):
         open_world("desk?frames=3&mask=none.png")
     assert frame.right_mask.all() and not frame.left_mask[:, :160].any() and frame.left_mask[:, 160:].all()

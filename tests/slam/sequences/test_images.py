@@ -13,8 +13,9 @@ import pytest
 
 from slam.errors import SequenceError
 from slam.sequences import open_sequence
-from slam.sequences.images import decode_image, read_image
+from slam.sequences.images import MOST_PIXELS, decode_image, read_image
 from tests import recordings
+from tests.fuzz.mutations import png
 
 SCENE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (90, 120)).astype(np.uint8), (0, 0), 1.5)
 
@@ -70,6 +71,11 @@ def test_grey_values_are_as_stored_and_colours_become_grey():
     PIL.Image.fromarray(np.array([[70_000, -5, 100_000]], np.int32)).save(large, "TIFF")
     with pytest.raises(SequenceError, match="int32, not 8 or 16 bit"):
         decode_image(large.getvalue(), "x")
+
+
+def test_a_huge_image_is_refused_by_its_header():
+    with pytest.raises(SequenceError, match=f"at most {MOST_PIXELS} pixels"):
+        decode_image(png((8_000, 9_000), b""), "x")
 
 
 def test_damaged_vanished_and_other_images_cost_no_more_than_themselves(kitti: Path) -> None:

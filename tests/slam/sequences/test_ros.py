@@ -141,12 +141,24 @@ def test_compressed_images(tmp_path: Path) -> None:
     assert seeds(sequence) == [(k, k + 10) for k in range(6)]
 
 
+def test_an_image_of_another_size_costs_its_frame_alone(tmp_path: Path) -> None:
+    store, rows = STORES[1], stereo(STORES[1])
+    third = [k for k, row in enumerate(rows) if row[0] == LEFT][2]
+    rows[third] = (*rows[third][:3], image(store, T0 + 2 * STEP, picture(2)[:, :32]))
+    sequence = slam.open_sequence(write(tmp_path / "hurt.bag", rows))
+    assert seeds(sequence) == [(k, k + 10) for k in (0, 1, 3, 4, 5)]
+    assert sequence.warnings == ["frame 2 skipped: /stereo/left/image_raw, message 2: image is 32x48, not 64x48"]
+
+
 def test_topics_can_be_named_and_a_missing_one_lists_those_there_are(bag: Path) -> None:
     assert np.allclose(slam.open_sequence(f"{bag}?left={LEFT}&right={RIGHT}&fps=3").stamps, np.arange(6) / 3)
     with pytest.raises(SequenceError, match=rf"/stereo/lft/image_raw: there is none .*mean '{LEFT}'.*{LEFT}, {RIGHT}"):
         slam.open_sequence(f"{bag}?left=/stereo/lft/image_raw&right={RIGHT}")
     with pytest.raises(ConfigurationError, match="left and right are the same topic"):
         slam.open_sequence(f"{bag}?left={LEFT}&right={LEFT}")
+    for option in ("unit=cm", "fisheye=yes"):  # camera messages are in metres, and name their lenses
+        with pytest.raises(ConfigurationError, match=r"does nothing with .*camera_info, which is ROS's"):
+            slam.open_sequence(f"{bag}?{option}")
 
 
 def test_depth_images_and_other_cameras_are_no_stereo_pair(tmp_path: Path) -> None:

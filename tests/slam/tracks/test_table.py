@@ -58,6 +58,13 @@ def test_a_frame_s_copy_has_room_and_leaves_the_landmarks_of_the_frame_before_as
     assert step.landmarks().ids.tolist() == [6] and step.landmarks().seen.tolist() == [2]
 
 
+def test_landmarks_of_a_saved_map_take_unused_rows():
+    tracks, looks = followed(3), features(6)
+    tracks = tracks.with_landmarks(LandmarkTable(np.arange(6) + 9, looks.descriptors, looks.laplacian))
+    assert tracks.landmarks().ids.tolist() == list(range(9, 15)) and (tracks.ids[:3] < 0).all()
+    np.testing.assert_array_equal(tracks.landmarks().descriptors, looks.descriptors)
+
+
 @pytest.mark.parametrize("window", [4, 6])
 def test_a_frame_s_copy_leaves_what_waits_for_a_depth_as_it_was(window):
     tracks, waits = followed(1), np.array([1])

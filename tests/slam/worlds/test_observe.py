@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from slam.errors import SlamError
 from slam.worlds import open_world
 from slam.worlds.observe import visible_landmarks
 
@@ -60,6 +61,22 @@ def test_only_what_the_camera_sees_is_visible():
         assert same.mean() > 0.97
         on_objects = sequence.landmarks.object[truth.ids] > 0
         assert 10 < on_objects.sum() < len(truth.ids)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("isle", r"unknown world 'isle' \(did you mean 'aisle'\?\)"),
+        ("aisle?sead=3", "world aisle: unknown option 'sead'"),
+        ("aisle?frames=0", "frames must be a whole number from 1 to 1000000, got '0'"),
+        ("aisle?sigma=nan", "sigma must be a number from 0 to 100, got 'nan'"),
+        ("aisle?seed=1&seed=2", "'seed' is given twice"),
+        ("aisle?drop=0:2000", "no frame is left"),
+    ],
+)
+def test_what_is_asked_for_wrongly_is_refused(text, message):
+    with pytest.raises(SlamError, match=message):
+        open_world(text)
 
 
 def test_faults_by_number_range_and_chance():
