@@ -25,7 +25,7 @@ from slam.bodies.estimator import FRAMES, BodyEstimator
 from slam.bodies.finder import Scene, parting
 from slam.bodies.fits import fit_positions, fit_velocities, record, revise_tracks
 from slam.bodies.following import follow, found_again, located, observed
-from slam.bodies.frame import NO_IDS, Frame, Setup, recent_poses, with_estimate
+from slam.bodies.frame import NO_IDS, Frame, OnlinePose, Setup, recent_poses
 from slam.bodies.membership import merge
 from slam.bodies.proof import Way, with_frame
 from slam.bodies.regions import Region, follow_regions
@@ -101,7 +101,7 @@ class MovingObjectDetector(ObjectDetector):
         self._stamps = np.full(window, np.nan)
         self._poses = np.tile(np.eye(4), (window, 1, 1))  # of the left camera in the window's frames
         self._number = -1
-        self._path: RecentPoses | None = None
+        self._path: list[OnlinePose] = []
         self._regions: list[Region] = []
 
     def revise(self, tracks: Tracks, correct: Callable[[Array], Array]) -> None:
@@ -167,8 +167,8 @@ class MovingObjectDetector(ObjectDetector):
         local = s.rig.triangulate(features.uv_left, features.uv_right)
         measured = among(len(local), tracks.row[tracks.row >= 0])
         measuring = local[measured & np.isfinite(local[:, 0])]
-        self._path = with_estimate(self._path, estimate, s.rig, s.sigma, measuring, FRAMES + 1)
-        cameras = recent_poses(recent, FRAMES + 1, self._path, estimate.covariance)
+        self._path = [*self._path[-FRAMES:], OnlinePose(s.rig, s.sigma, estimate, measuring)]
+        cameras = recent_poses(recent, self._path)
         return Frame(s, self._number, features, local, self._stamps.copy(), self._poses.copy(), cameras)
 
     def _advance_bodies(self, tracks: Tracks, frame: Frame) -> None:

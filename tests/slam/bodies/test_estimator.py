@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 import backends
 from slam.bodies.belief import slid
 from slam.bodies.estimator import FRAMES, BodyEstimator
-from slam.bodies.frame import recent_poses, with_estimate
+from slam.bodies.frame import OnlinePose, recent_poses
 from slam.data import Observations, RecentPoses
 from slam.evaluation.metrics import chi_square_band
 from slam.geometry import se3
@@ -254,18 +254,20 @@ def test_too_few_points_begin_no_body():
 def test_derived_recent_poses():
     """The newest pose has its own covariance; an increment has the noise of two frames, whatever is shared."""
     scene, rng = box_scene(seed=2, frames=FRAMES), np.random.default_rng(0)
-    backend, path, known = backends.create("batch", scene.rig, models=scene.models), None, set()
+    backend, path, known = backends.create("batch", scene.rig, models=scene.models), [], set()
     for k, stamp in enumerate(scene.stamps):
         backend.predict(float(stamp))
         seen = scene.background(k, rng)
         old = np.array([i in known for i in seen.ids.tolist()], bool)
         backend.update(seen.select(old))
         e, local = backend.estimate(landmarks=False), scene.rig.triangulate(seen.uv_left, seen.uv_right)
-        path = with_estimate(path, e, scene.rig, SIGMA, local[old], 3)
+        path = [*path[-2:], OnlinePose(scene.rig, SIGMA, e, local[old])]
         backend.add(seen.select(~old))
         known.update(seen.ids.tolist())
     wide = e.covariance + np.diag([0, 0, 0, 1.0, 1, 1])
-    recent = recent_poses(None, 3, path, wide)  # a back end without `recent`
+    recent = recent_poses(
+        None, [*path[:-1], replace(path[-1], estimate=replace(e, covariance=wide))]
+    )  # a back end without `recent`
     assert len(recent) == 3 and recent.stamps[-1] == scene.stamps[-1]
     assert recent.covariance[-6:, -6:] == pytest.approx(wide)
     J = np.concatenate([-se3.adjoint(se3.inverse(recent.poses[2]) @ recent.poses[1]), np.eye(6)], axis=1)
