@@ -189,7 +189,7 @@ class MovingObjectDetector(ObjectDetector):
             tracks.position[mine] = transform(body.T, tracks.local[mine])
         for column in (tracks.A, tracks.p, tracks.dof):  # what the slot held leaves the window
             column[:, frame.slot] = 0
-        self._record(tracks, np.flatnonzero(tracks.found), frame)
+        record(tracks, np.flatnonzero(tracks.found), frame)
 
     def _estimated(self, body: Body, tracks: Tracks, frame: Frame) -> Body:
         """The body after this frame."""
@@ -201,11 +201,9 @@ class MovingObjectDetector(ObjectDetector):
         front = (b for b in self.bodies.values() if b.proven and not b.gone and b.id != body.id)
         tracks.row[mine[hidden(front, frame.eye, tracks.position[mine])]] = -1
         belief = located(body, tracks, frame, self._estimator)
+        if belief is None or not self.setup.models.known(belief.estimate):  # it begins anew once it is found again
+            return replace(body, belief=None)
         return with_belief(body, belief, slot, stamp, self.setup.config.min_speed)
-
-    def _record(self, tracks: Tracks, rows: IndexArray, frame: Frame) -> None:
-        """Add what tracks (K,) measured in this frame."""
-        record(tracks, rows, frame.slot, self.setup.rig, frame.T_world_left, frame.features, self.setup.sigma)
 
     def _fit(self, tracks: Tracks, frame: Frame) -> None:
         """Positions of free tracks, and velocities of those that may move."""
@@ -297,7 +295,7 @@ class MovingObjectDetector(ObjectDetector):
         numbers = np.arange(self._next_track, self._next_track + len(new))
         self._next_track += len(new)
         tracks.begin(new, numbers, f, transform(frame.T_world_left, frame.local[tracks.row[new]]))
-        self._record(tracks, new, frame)
+        record(tracks, new, frame)
         fit_positions(tracks, new)
 
     def _of_proven(self, tracks: Tracks) -> BoolArray:

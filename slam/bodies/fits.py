@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.bodies.bodies import Body
+from slam.bodies.frame import Frame
 from slam.bodies.track_kernels import constant_velocities, fit_fixed_points, points_on_rays
-from slam.data import IndexArray, StereoFeatures
+from slam.data import IndexArray
 from slam.geometry.rig import StereoRig, measurement_rows
 from slam.geometry.se3 import Array
 from slam.tracks.table import Tracks
@@ -31,14 +32,12 @@ def measure(rig: StereoRig, T_world_left: Array, points: Array, measured: Array,
     return found
 
 
-def record(
-    tracks: Tracks, rows: IndexArray, slot: int, rig: StereoRig, T_world_left: Array, features: StereoFeatures,
-    sigma: float,
-) -> None:  # fmt: skip
+def record(tracks: Tracks, rows: IndexArray, frame: Frame) -> None:
     """Enter what the features of tracks (K,) measure in this frame, in place."""
-    z = measurement_rows(features.uv_left[tracks.row[rows]], features.uv_right[tracks.row[rows]])
-    points, tracks.A[rows, slot], tracks.dof[rows, slot] = measure(rig, T_world_left, tracks.position[rows], z, sigma)
-    tracks.p[rows, slot] = points - tracks.anchor[rows]
+    f, slot, at, s = frame.features, frame.slot, tracks.row[rows], frame.setup
+    z = measurement_rows(f.uv_left[at], f.uv_right[at])
+    points, A, dof = measure(s.rig, frame.T_world_left, tracks.position[rows], z, s.sigma)
+    tracks.A[rows, slot], tracks.p[rows, slot], tracks.dof[rows, slot] = A, points - tracks.anchor[rows], dof
 
 
 def fit_positions(tracks: Tracks, rows: IndexArray) -> None:

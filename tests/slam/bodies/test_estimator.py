@@ -17,6 +17,7 @@ from slam.data import Observations, RecentPoses
 from slam.evaluation.metrics import chi_square_band
 from slam.geometry import se3
 from slam.models import ObjectModels
+from slam.object_data import ObjectEstimate
 from slam.window.problem import Motion
 from slam.window.stereo import RectifiedStereo
 from tests.slam.bodies.body_scene import SIGMA, box_scene, car_scene, follow, score
@@ -287,3 +288,11 @@ def test_what_a_body_can_do():
     assert not models.possible(fast, known, still, known, 0.1)
     assert models.possible(fast, known, still, known, 0.2)
     assert models.possible(fast, known, still, 0.1 * np.eye(6), 0.1)  # it may have been that fast before
+    none = np.zeros(0, np.int64)
+
+    def estimate(P, V):
+        return ObjectEstimate(1, 0.0, np.eye(4), P, np.zeros(6), V, True, none, none)
+
+    assert models.known(estimate(known, known))
+    assert not models.known(estimate(np.diag([1, 1, 1, 4, 4, 4.0]), known))
+    assert not models.known(estimate(known, np.full((6, 6), np.nan)))
