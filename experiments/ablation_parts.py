@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from experiments.common import path_of, recordings
 from slam.config import SystemConfig
 from slam.data import CommonError, FrameResult
+from slam.evaluation.joint_errors import JointErrors, with_newest
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.trajectory import Trajectory
 from slam.sequences import Sequence, open_sequence
@@ -148,6 +149,8 @@ def path_figures(results: list[FrameResult], case: Case, sequence: Sequence) -> 
     """Error of the online path [m], NEES, number of frames, and of those without a measured pose."""
     measured = [r for r in results if r.status.measured]
     path, P = path_of(measured), np.array([r.estimate.covariance for r in measured])
-    found = consistency(path, P, sequence, [r.common for r in measured])
+    blocks = [with_newest(r.recent, path.stamps[: k + 1].tolist()) for k, r in enumerate(measured)]
+    joint = JointErrors.of(blocks, np.arange(len(measured)))
+    found = consistency(path, P, sequence, [r.common for r in measured], joint)
     nees = found.get(f"NEES over {case.over} m", float("nan"))
     return [error_of(path, sequence), nees, len(results), len(results) - len(measured)]

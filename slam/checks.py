@@ -110,8 +110,8 @@ def known_landmarks(
     MeasurementError.
     """
     require_known(backend, ids, positions, covariances)
-    if seen:
-        require_in_front(backend, ids, positions)
+    if seen and (behind := ~in_front(positions)).any():
+        raise MeasurementError(f"{backend}: landmark {ids[behind][0]} does not lie in front of the camera")
     table.require_new(ids)
     return np.array(ids, np.int64), np.array(positions, float), np.array(covariances, float)
 
@@ -119,13 +119,6 @@ def known_landmarks(
 def in_front(local: Array) -> BoolArray:
     """Which points (N, 3) [m] in a camera's coordinates lie in front of it (N,)."""
     return np.asarray(local[:, 2] >= _NEAREST)
-
-
-def require_in_front(backend: str, ids: IdArray, local: Array) -> None:
-    """Raise MeasurementError where a landmark at `local` (N, 3) [m] in the camera's coordinates is not before it."""
-    bad = ~in_front(local)
-    if bad.any():
-        raise MeasurementError(f"{backend}: landmark {ids[bad][0]} does not lie in front of the camera")
 
 
 def _positive_definite(covariances: Array) -> BoolArray:

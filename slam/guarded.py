@@ -13,6 +13,7 @@ import numpy as np
 from slam.checks import require_guess, require_not_measured, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
+from slam.geometry.arrays import LandmarkRows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
@@ -25,8 +26,10 @@ def guarded(backend: Any) -> Any:
     Refused, and nothing changed, are options that its constructor does not name, stamps that do not increase, calls
     before the first `predict`, ids that are not in the map, or to be added and in it, new landmarks without a depth, a
     second update of a stamp or one after an `add`, and guesses that are no pose. An update without rows is EMPTY.
-    Answers are copies: what the caller writes into them does not reach the back end. Of its additional methods those
-    that move the camera or the map count here, too; but what these are given, it checks itself.
+    Answers are copies: what the caller writes into them does not reach the back end. An update that used no observation
+    is EMPTY. A class without ``positions`` or ``trajectory`` has those of its estimates: a filter's, never revised.
+    Of its additional methods those that move the camera or the map count here, too; but what these are given, it checks
+    itself.
     """
     own = {key: getattr(backend, key) for key in ("__qualname__", "__module__", "__doc__")}
     others = [name for name in dir(backend) if not name.startswith("_") and not hasattr(_Guarded, name)]
@@ -47,6 +50,7 @@ class _Guarded:
             raise ConfigurationError(f"{self._name}: unknown option {min(unknown)!r}")
         self._backend = self.__wrapped__(rig, models or EstimatorModels(), **options)
         self._ids, self._measured, self._stamp = set[int](), True, float("nan")
+        self._path: dict[float, Array] = {}
 
     def __getattr__(self, attribute: str) -> Any:  # what the back end sets itself
         if attribute.startswith("_"):
@@ -73,15 +77,21 @@ class _Guarded:
         require_stamp(self._name, stamp, None if np.isnan(self._stamp) else self._stamp)
         found = deepcopy(predict(float(stamp)))
         self._stamp, self._measured = float(stamp), False
+        self._path[self._stamp] = found.T_world_left.copy()
         return found
 
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         self._require(observations.ids)
         require_not_measured(self._name, self._measured)
         require_guess(self._name, guess)
-        report = UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
-        report = deepcopy(self._backend.update(observations, guess)) if len(observations) else report
+        if not len(observations):
+            self._measured = True
+            return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
+        report = deepcopy(self._backend.update(observations, guess))
         self._measured = True
+        self._path[self._stamp] = self._backend.estimate(False).T_world_left.copy()
+        if report.status is UpdateStatus.OK and not len(report.used):
+            return UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", report.rejected)
         return report
 
     def add(self, observations: Observations) -> None:
@@ -99,7 +109,11 @@ class _Guarded:
         self._ids = self._ids - set(gone)
 
     def positions(self, ids: IdArray) -> Array:
-        return np.array(self._backend.positions(np.array(self._require(ids), np.int64)))
+        asked = np.array(self._require(ids), np.int64)
+        if hasattr(self._backend, "positions"):
+            return np.array(self._backend.positions(asked))
+        found = self._backend.estimate()
+        return np.array(found.positions[LandmarkRows(found.ids).rows_of(asked)])
 
     def estimate(self, landmarks: bool = True) -> Estimate:
         self._require()
@@ -107,8 +121,10 @@ class _Guarded:
         return found
 
     def trajectory(self) -> Trajectory:
-        found: Trajectory = deepcopy(self._backend.trajectory())
-        return found
+        if hasattr(self._backend, "trajectory"):
+            found: Trajectory = deepcopy(self._backend.trajectory())
+            return found
+        return Trajectory(np.array(list(self._path)), np.array(list(self._path.values())).reshape(-1, 4, 4))
 
 
 class _Additional(_Guarded):

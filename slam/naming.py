@@ -61,14 +61,6 @@ def point(values: NDArray) -> str:
     return "(" + ", ".join(f"{value:.3f}" for value in values) + ")"
 
 
-def widest(positions: NDArray) -> tuple[int, int]:
-    """The two coordinates of positions (N, 3) with the largest range, for a plane picture."""
-    if not len(positions):
-        return 0, 2
-    first, second = sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2].tolist())
-    return first, second
-
-
 def sequence_line(sequence: Any) -> str:
     """A sequence in one line: its name, its length, and further facts."""
     stamps, rig, truth = sequence.stamps, sequence.rig, sequence.ground_truth

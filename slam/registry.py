@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from slam.errors import ConfigurationError, SlamError, UnknownNameError, cause, text_of
-from slam.naming import unknown
+from slam.naming import suggestion, unknown
 
 #: What this distribution brings, so that a plain checkout works without being installed.
 BUILT_IN = {
@@ -90,7 +90,8 @@ def resolve(role: str, name: str) -> Any:
             raise UnknownNameError(f"{failed} {cause(error)}") from error
         raise UnknownNameError(f"{failed} {text_of(error)}{where}") from error
     except (ImportError, AttributeError, ValueError, TypeError, SyntaxError) as error:
-        raise UnknownNameError(f"{failed} {text_of(error)}") from error
+        near = suggestion(attribute, dir(sys.modules[module])) if module in sys.modules else ""
+        raise UnknownNameError(f"{failed} {text_of(error)}{near}") from error
     except (Exception, SystemExit) as error:  # whatever a foreign module does when it is imported
         raise UnknownNameError(f"{failed} {cause(error)}") from error
 
@@ -159,7 +160,8 @@ def require_methods(role: str, part: Any, name: str = "") -> Any:
     if isinstance(part, type):
         made = f"{part.__name__}(rig.rectified.rig)" if role == "backends" else f"{part.__name__}(rig)"
         raise ConfigurationError(f"{_spoken(role)} {part.__name__} is a class: give an instance, such as {made}")
-    missing = [method for method in METHODS[role] if not callable(getattr(part, method, None))]
+    own = getattr(part, "__wrapped__", part)  # behind `slam.guarded`, which has them all
+    missing = [method for method in METHODS[role] if not callable(getattr(own, method, None))]
     if missing and (part is not None or role == "backends"):
         what = f"{_spoken(role)} {name or type(part).__name__}"
         raise ConfigurationError(f"{what} is none: it lacks {', '.join(missing)}")

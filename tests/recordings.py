@@ -67,10 +67,10 @@ def cut(path: Path, share: float = 0.5) -> None:
     path.write_bytes(data[: int(len(data) * share)])
 
 
-def write_sensor(path: Path, baseline: float = 0.11) -> None:
-    """EuRoC's sensor.yaml of a camera `baseline` to the right of camera 0."""
+def write_sensor(path: Path, baseline: float = 0.11, axis: int = 0) -> None:
+    """EuRoC's sensor.yaml of a camera `baseline` to the right of camera 0, or below it: along its `axis`."""
     T = BODY_CAMERA.copy()
-    T[:3, 3] += T[:3, 0] * baseline
+    T[:3, 3] += T[:3, axis] * baseline
     path.parent.mkdir(parents=True, exist_ok=True)
     numbers = ", ".join(str(x) for x in T.ravel())
     path.write_text(SENSOR.format(T=numbers, width=WIDTH, height=HEIGHT))
@@ -171,9 +171,22 @@ def write_video(path: Path, images: list[np.ndarray], codec: str = "mp4v", rate:
     writer.release()
 
 
-def write_opencv(path: Path, rig: StereoRig) -> None:
-    """Write a rig with the entries of ``cv2.stereoCalibrate`` [m]."""
-    entries = {"image_width": rig.width, "image_height": rig.height, "R": rig.R, "T": (rig.R @ rig.b).reshape(3, 1)}
+def write_opencv(path: Path, rig: StereoRig, unit: float = 1.0) -> None:
+    """Write a rig with the entries of ``cv2.stereoCalibrate``, lengths in `unit` to the metre."""
+    T = unit * (rig.R @ rig.b).reshape(3, 1)
+    entries = {"image_width": rig.width, "image_height": rig.height, "R": rig.R, "T": T}
     for number, camera in enumerate((rig.left, rig.right), 1):
         entries |= {f"K{number}": camera.K, f"D{number}": np.array([camera.distortion or (0.0,) * 4])}
     write_storage(path, entries)
+
+
+def write_oxts(drive: Path, records: list[str]) -> None:
+    """Records of the GPS/IMU unit of a KITTI raw drive by their first six numbers, and how it stands to camera 0."""
+    (drive / "oxts" / "data").mkdir(parents=True)
+    for i, record in enumerate(records):
+        (drive / "oxts" / "data" / f"{i:010d}.txt").write_text(record + " 0" * 24 + "\n")
+    (drive / "oxts" / "timestamps.txt").write_text((drive / "image_00" / "timestamps.txt").read_text())
+    # camera z is the IMU's x (ahead), camera x minus its y, camera y minus its z
+    turn = "R: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 -0.5\n"
+    (drive.parent / "calib_velo_to_cam.txt").write_text("calib_time: 15-Mar-2012\n" + turn)
+    (drive.parent / "calib_imu_to_velo.txt").write_text("R: 1 0 0 0 1 0 0 0 1\nT: 0 0 0\n")

@@ -40,11 +40,11 @@ FAULTS = (
     # the filter
     Fault(
         "turning the camera moves points the wrong way", "backends/ekf/motion.py",
-        "W[:3, 3:], W[3:, 3:] = hat(self.x[:3]) @ A, A", "W[:3, 3:], W[3:, 3:] = -hat(self.x[:3]) @ A, -A",
+        "W[:3, 3:], W[3:, 3:] = hat(self.x[:3]) @ turn, turn", "W[:3, 3:], W[3:, 3:] = -hat(self.x[:3]) @ turn, -turn",
         "tests/backends/test_ekf_parts.py tests/backends/test_ekf.py",
     ),
     Fault(
-        "what has left the state is corrected as if it were in it", "backends/ekf/covariance.py",
+        "the last poses are corrected as if they were in the state", "backends/ekf/covariance.py",
         "P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]", "by_rig[last] = self.by_rig[last]",
         "tests/backends/test_ekf_parts.py tests/backends/test_all_backends.py tests/backends/test_ekf.py",
     ),

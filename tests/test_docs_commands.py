@@ -16,7 +16,7 @@ import pytest
 import slam
 from slam.geometry.trajectory import Trajectory
 from slam.worlds.export import write_euroc
-from tests.recordings import write_storage, write_video
+from tests.recordings import write_opencv, write_video
 from tests.test_docs import DOCS, PAGES, ROOT, blocks, commands
 
 pytestmark = pytest.mark.slow
@@ -46,11 +46,11 @@ def reader(tmp_path_factory):
     write_euroc(sequence, root / "euroc")
     for name, file, unit in (("recording", "calibration.yaml", 1), ("mine", "stereo.yml", 1000)):
         (root / name).mkdir()
-        write_calibration(root / name / file, sequence.rig, unit)
+        write_opencv(root / name / file, sequence.rig, unit)
     both = [np.hstack([frame.left, frame.right]) for frame in sequence]
     write_images(root / "images", both)
     for folder in (root, root / "images"):
-        write_calibration(folder / "calibration.yaml", sequence.rig, 1)
+        write_opencv(folder / "calibration.yaml", sequence.rig)
     for name in ("walk", "both"):
         write_video(root / f"{name}.mp4", both)
     for side in ("left", "right"):
@@ -70,12 +70,6 @@ def write_images(folder, images):
     folder.mkdir()
     for k, image in enumerate(images):
         cv2.imwrite(str(folder / f"{k:06}.png"), image)
-
-
-def write_calibration(path, rig, unit):
-    """The rig in OpenCV's names, lengths in `unit` to the metre."""
-    lenses = {"D1": np.zeros(5), "D2": np.zeros(5)}
-    write_storage(path, {"M1": rig.left.K, "M2": rig.right.K, **lenses, "R": rig.R, "T": unit * rig.R @ rig.b})
 
 
 def shortened(words):

@@ -73,7 +73,7 @@ class Camera(Protocol):
 Motion = tuple[Camera, Array, Array]
 
 
-def moved(camera: Camera, models: EstimatorModels, P: Array, dt: float, rests: bool) -> Motion:
+def predicted(camera: Camera, models: EstimatorModels, P: Array, dt: float, rests: bool) -> Motion:
     """A camera with the error's covariance P (12, 12), after `dt` [s]: ``A P Aᵀ + W Q Wᵀ`` (paper B, section 2).
 
     One that rests keeps its pose, and its velocity is zero for certain. One that may have turned anyhow meanwhile stays
@@ -85,7 +85,7 @@ def moved(camera: Camera, models: EstimatorModels, P: Array, dt: float, rests: b
     if anyhow is not None:
         return camera.stopped(), np.zeros_like(P), camera.of_body(anyhow)
     camera, A, W = camera.advanced(dt)
-    return camera, A, W * np.repeat(models.motion.velocity_variance(dt), 3) @ W.T
+    return camera, A, (W * np.repeat(models.motion.velocity_variance(dt), 3)) @ W.T
 
 
 def prior(models: EstimatorModels) -> Array:

@@ -1,10 +1,8 @@
-"""The filter's covariance: of what is in the state, and of what has left it.
+"""The filter's covariance: of the camera, its last poses and the landmarks, one dense matrix.
 
-A landmark that has left is parked: it is corrected no more, but its error's covariance with the state goes on, as in
-the filter of Schmidt, whose covariance is exact for what it does. With the gain of such a landmark zero, ``P_AA``
-changes as ever, ``P_Ab ← (1 − K H) P_Ab`` and ``P_bb`` not at all. When it is measured again it joins the state with
-its covariances.
-The camera's last poses, as they were believed in their time, are kept in the same way (stochastic clones).
+The last poses are corrected no more: they stay as they were believed in their time (stochastic clones). Their errors'
+covariance with the others goes on, as in the filter of Schmidt, which is exact for what it does: with a gain of zero
+``P_ab ← (1 − K H) P_ab`` and ``P_bb`` stays.
 What is known of a landmark from elsewhere is independent of all else until it is measured: nothing need be carried.
 
 Errors of the rig (`slam.interfaces.ConsideringBackend`) are considered, too, but not estimated. What is kept are the
@@ -31,7 +29,7 @@ _BLOCK = 64  # cost: rows that are mirrored at once
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Of ``[camera (12), last poses (24), B landmarks that are parked (3B), A that are in the state (3A)]``, n numbers.
+    """Of ``[camera (12), last poses (24), N landmarks (3N)]``, n numbers.
 
     The poses are perturbed on the right, the newest first; zero before there are so many. Rows of the table of
     landmarks are in this order; behind them are those that are known from elsewhere.
@@ -40,7 +38,6 @@ class Covariance:
     P: Array  # (n, n)
     by_rig: Array  # derivatives (n, m) of all errors by those of the rig
     known: Array  # (C, 3, 3), of each landmark that is independent of all else
-    parked: int = 0  # B
 
     @classmethod
     def of_camera(cls, P: Array, by_rig: Array | None = None) -> Covariance:
@@ -49,13 +46,8 @@ class Covariance:
         return cls(np.pad(P, more), np.pad(by_rig, (more, (0, 0))), np.zeros((0, 3, 3)))
 
     @property
-    def begin(self) -> int:
-        """36 + 3B: where the landmarks of the state begin."""
-        return HEAD + 3 * self.parked
-
-    @property
     def correlated(self) -> int:
-        """B + A: the landmarks after these are known from elsewhere."""
+        """N: the landmarks after these are known from elsewhere."""
         return (len(self.P) - HEAD) // 3
 
     @property
@@ -127,7 +119,7 @@ class Covariance:
     def appended(self, J: Array, noise: Array, by_rig: Array) -> Covariance:
         """With landmarks ``Y = g(r, φ) + noise`` (paper A, Eq. 10), by derivatives (M, 3, 6) and covariances (M, 3, 3).
 
-        They are the last ones of the state. With the pose known, errors of the rig move them by `by_rig` (M, 3, m).
+        They are the last ones. With the pose known, errors of the rig move them by `by_rig` (M, 3, m).
         """
         n, each, by_pose = len(self.P), np.arange(len(J)), J.reshape(-1, POSE)
         P, cross = np.empty((n + len(by_pose),) * 2), by_pose @ self.P[:POSE]
@@ -138,39 +130,38 @@ class Covariance:
         moved = by_pose @ self.by_rig[:POSE] + by_rig.reshape(len(by_pose), -1)
         return replace(self, P=P, by_rig=np.concatenate([self.by_rig, moved]))
 
-    def rearranged(self, parked: IndexArray, state: IndexArray, known: IndexArray) -> Covariance:
-        """With other landmarks in each of its parts, or fewer; by their rows of the table of landmarks."""
-        rows = np.concatenate([parked, state])
+    def rearranged(self, rows: IndexArray, known: IndexArray) -> Covariance:
+        """With other landmarks in each of its two parts, or fewer; by their rows of the table of landmarks."""
         joining = np.flatnonzero(rows >= self.correlated)
         numbers = np.append(np.arange(HEAD), self.numbers(rows)).clip(max=len(self.P) - 1)
         P = np.ascontiguousarray(self.P[numbers].T)[numbers]  # rows alone are copied fast
         by_rig, at = self.by_rig[numbers], self.numbers(joining)
         P[at], P[:, at], by_rig[at] = 0.0, 0.0, 0.0
         P[at[:, :, None], at[:, None, :]] = self.known[rows[joining] - self.correlated]
-        return replace(self, P=P, by_rig=by_rig, known=self.known[known - self.correlated], parked=len(parked))
+        return replace(self, P=P, by_rig=by_rig, known=self.known[known - self.correlated])
 
     # --- an update ---
 
     def corrected(self, V: Array, lost_by_rig: Array, J: Array, shift: Array) -> Covariance:
         """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ = P − V Vᵀ`` (paper A, Eq. 11).
 
-        Last poses and parked landmarks keep the covariance that they have among themselves.
+        The last poses keep the covariance that they have among themselves.
 
         Args:
             V: ``P Hᵀ L⁻ᵀ`` (n, 3M), with ``S = L Lᵀ``.
             lost_by_rig: L⁻¹ times derivatives (3M, m) of the innovation by errors of the rig.
             J: the camera's error becomes J (12, 12) times what it was,
-            shift: and then to those of the state's landmarks this (A, 3, 6) times that of the pose is added.
+            shift: and then to those of the landmarks this (N, 3, 6) times that of the pose is added.
         """
-        last, by_rig, K = slice(CAMERA, self.begin), self.by_rig - V @ lost_by_rig, np.zeros((len(self.P), CAMERA))
+        last, by_rig, M = slice(CAMERA, HEAD), self.by_rig - V @ lost_by_rig, np.zeros((len(self.P), CAMERA))
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
         P[:CAMERA, :CAMERA] = mirrored(P[:CAMERA, :CAMERA])
-        K[:CAMERA], K[self.begin :] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
-        half = 0.5 * K @ P[:CAMERA, :CAMERA]  # T = 1 + [K, 0]:  T P Tᵀ = P + K Yᵀ + Y Kᵀ,  Y = P[:, :12] + K P_cc / 2
-        P = dsyr2k(1.0, K, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
-        by_rig += K @ by_rig[:CAMERA]
+        M[:CAMERA], M[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
+        half = 0.5 * M @ P[:CAMERA, :CAMERA]  # T = 1 + [M, 0]:  T P Tᵀ = P + M Yᵀ + Y Mᵀ,  Y = P[:, :12] + M P_cc / 2
+        P = dsyr2k(1.0, M, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
+        by_rig += M @ by_rig[:CAMERA]
         P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]
-        summands = self.P.diagonal() + 2 * (half * K).sum(axis=1)
+        summands = self.P.diagonal() + 2 * (half * M).sum(axis=1)
         summands[last] = 0.0
         return replace(self, P=positive(mirrored(P), summands, V.shape[1]), by_rig=by_rig)
 

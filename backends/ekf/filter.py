@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from backends.ekf.camera import Camera, moved
+from backends.ekf.camera import Camera, predicted
 from backends.ekf.covariance import CAMERA, POSE, RECENT, Covariance, positive
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
@@ -141,7 +141,7 @@ class LandmarkFilter:
         anchors = np.tile(np.eye(3, 4), (len(ids), 1, 1))
         anchors[:, :, 3] = positions
         anchors[:, 2, 3] -= np.maximum(_STAND_OFF * np.sqrt(np.trace(covariances, axis1=1, axis2=2)), 1.0)
-        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, s.frame, np.pi)
+        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, np.pi)
         D = self._coordinates.inverse_jacobian(anchors, new.c)
         self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
 
@@ -207,19 +207,19 @@ class LandmarkFilter:
 
         Features slide as the viewpoint changes: this widens the landmarks in view (`FilterState.slid`).
         """
-        s = self.state.relieved()
+        s = self.state
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
         if s.frame < 0:
             after = replace(s, stamp=float(stamp), frame=0, closed=False)
         else:
-            motion = moved(s.camera, self.models, s.covariance.camera, stamp - s.stamp, rests)
+            motion = predicted(s.camera, self.models, s.covariance.camera, stamp - s.stamp, rests)
             after = s.advanced(float(stamp), motion)
         T, rows = after.pose, self._measure.visible(after.pose, after.landmarks.points)
         after = after.slid(self._coordinates, rows, self.models.slide.density / self._measure.stereo.f)
         marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
-        A = -toward @ (marks.gauge @ after.camera.displacement())  # derivatives (M, 3, 6) of them, seen from the camera
-        seen = (A @ after.covariance.pose + 2 * toward @ cross) @ A.transpose(0, 2, 1)
+        by_pose = -toward @ (marks.gauge @ after.camera.displacement())  # (M, 3, 6), of them as seen from the camera
+        seen = (by_pose @ after.covariance.pose + 2 * toward @ cross) @ by_pose.transpose(0, 2, 1)
         seen = 0.5 * (seen + seen.transpose(0, 2, 1)) + toward @ blocks @ toward.transpose(0, 2, 1)
         left, right, S = self._measure.pixels((marks.points - T[:3, 3]) @ T[:3, :3], seen)
         prediction = Prediction(after.stamp, T.copy(), after.pose_covariance(), marks.ids, left, right, S)
@@ -247,7 +247,7 @@ class LandmarkFilter:
             return landmarks_pose(measure, update.landmarks.points, z, T, s.frame + 1)
 
         try:
-            found = agreement(update, search)
+            found = agreement(update, guess, search)
             if found is None:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids.copy())

@@ -1,4 +1,4 @@
-"""What an update measures, linearised: ``z = h(x)`` and H (paper A, Eqs. 5-10; B, Eqs. 1-5), ν and ``S = H P Hᵀ + R``.
+"""What an update measures, linearised: ``z = h(x)`` and H (paper A, Eqs. 5-7; B, Eqs. 1-5), ν and ``S = H P Hᵀ + R``.
 
 A landmark's measurement depends on where it is as seen from the camera alone. An error x of the camera's pose moves it
 there by ``−lever x`` in its own coordinates, so that ``H = own [−lever, 1]`` has columns for the pose and the
@@ -16,7 +16,7 @@ from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from backends.ekf.camera import Camera
-from backends.ekf.covariance import CAMERA, POSE, Covariance
+from backends.ekf.covariance import CAMERA, HEAD, POSE, Covariance
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
@@ -37,7 +37,6 @@ class Update:
     measure: RectifiedMeasurement  # what they measure, their noise, and the gate
     coordinates: Coordinates
     iterations: int  # most linearisations
-    guess: Array | None = None  # a pose (4, 4) to linearise at where it is not linear from the prior on
 
     @property
     def sigma(self) -> float:
@@ -45,10 +44,11 @@ class Update:
         return self.measure.models.pixel_sigma
 
     def facing(self, T: Array) -> Update:
-        """With a guess T (4, 4), and the same prior in coordinates that are regular from there to here."""
+        """The same prior in coordinates that are regular from a pose T (4, 4) to here; itself where they are."""
         camera, J = self.camera.facing(T)
-        P = self.covariance if camera is self.camera else self.covariance.camera_moved(J, np.zeros((CAMERA, CAMERA)))
-        return replace(self, camera=camera, covariance=P, guess=T)
+        if camera is self.camera:
+            return self
+        return replace(self, camera=camera, covariance=self.covariance.camera_moved(J, np.zeros((CAMERA, CAMERA))))
 
     @cached_property
     def numbers(self) -> IndexArray:
@@ -58,7 +58,7 @@ class Update:
     @cached_property
     def measured(self) -> IndexArray:
         """And in a change of the state (12 + 3A,), which is of the camera and the landmarks in it."""
-        return np.append(np.arange(POSE), self.numbers[POSE:] - self.covariance.begin + CAMERA)
+        return np.append(np.arange(POSE), self.numbers[POSE:] - HEAD + CAMERA)
 
     @cached_property
     def lever(self) -> Array:
@@ -90,7 +90,7 @@ class Update:
         """
         there, marks = camera or self.camera, self.landmarks
         J = np.eye(CAMERA) if camera is None else self.camera.transport(camera)
-        change = np.zeros(CAMERA + len(self.covariance.P) - self.covariance.begin)
+        change = np.zeros(CAMERA + len(self.covariance.P) - HEAD)
         if camera is not None:
             change[:CAMERA] = np.linalg.solve(J, there.minus(self.camera))
         if moved is not None:
@@ -103,7 +103,8 @@ class Update:
         seen = np.isfinite(self.z) & np.isfinite(z).all(axis=1, keepdims=True)
         own = by_point @ (R.T @ self.coordinates.jacobian(marks.anchors, marks.c))
         own = np.where(seen[:, :, None], own, 0.0)
-        lever = self.lever if camera is None is moved else marks.gauge @ (there.displacement() @ J[:POSE, :POSE])
+        # an error that is transported displaces the world by the same, wherever it is written
+        lever = marks.gauge @ (self.camera if self.camera.transports else there).displacement()
         return Linearisation(self, there, J, change, z, seen, own, lever)
 
 
@@ -194,7 +195,7 @@ class Solution:
     @cached_property
     def change(self) -> Array:
         """Of the state (n,) from the prior, in the prior's coordinates: ``K ν = P Hᵀ y``."""
-        return np.delete(self.y @ self.at.HP[self.rows], np.s_[CAMERA : self.at.update.covariance.begin])
+        return np.delete(self.y @ self.at.HP[self.rows], np.s_[CAMERA:HEAD])
 
     @cached_property
     def camera(self) -> Camera:

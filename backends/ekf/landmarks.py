@@ -101,22 +101,21 @@ class FilterLandmarks(LandmarkRows):
     c: Array  # coordinates (N, 3)
     points: Array  # positions (N, 3) [m] in the world, which follow from the two
     gauge: Array  # derivatives (N, 3, 6) of the coordinates by one of the world [shift, turn about its origin]
-    seen: IndexArray  # number of the frame (N,) that measured each last; that of its first sight at least
     turned: Array  # largest angle (N,) between the lines of sight at first and since [rad]; π if known from elsewhere
 
     @classmethod
     def at(
-        cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array, frame: int, turned: float = 0.0
-    ) -> FilterLandmarks:  # fmt: skip
+        cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array, turned: float = 0.0
+    ) -> FilterLandmarks:
         """New ones at positions (M, 3)."""
         c = coordinates.of(anchors, points)
-        seen, angle = np.full(len(ids), frame), np.full(len(ids), turned)
-        return cls(ids, anchors, c, points, gauge_jacobian(coordinates, anchors, c, points), seen, angle)
+        gauge = gauge_jacobian(coordinates, anchors, c, points)
+        return cls(ids, anchors, c, points, gauge, np.full(len(ids), turned))
 
     @classmethod
     def none(cls) -> FilterLandmarks:
         """No landmarks."""
-        return cls.at(Euclidean(), np.zeros(0, np.int64), np.zeros((0, 3, 4)), np.zeros((0, 3)), 0)
+        return cls.at(Euclidean(), np.zeros(0, np.int64), np.zeros((0, 3, 4)), np.zeros((0, 3)))
 
     def moved(self, coordinates: Coordinates, rows: IndexArray | slice, change: Array) -> FilterLandmarks:
         """With a change (M, 3) of the coordinates of some rows."""
@@ -124,7 +123,7 @@ class FilterLandmarks(LandmarkRows):
         c[rows] = coordinates.moved(self.c[rows], change)
         points[rows] = coordinates.points(anchors, c[rows])
         gauge[rows] = gauge_jacobian(coordinates, anchors, c[rows], points[rows])
-        return replace(self, c=c, points=points, gauge=gauge, seen=self.seen.copy())
+        return replace(self, c=c, points=points, gauge=gauge)
 
 
 def gauge_jacobian(coordinates: Coordinates, anchors: Array, c: Array, points: Array) -> Array:

@@ -68,8 +68,8 @@ class EulerCamera:
 
     def displacement(self) -> Array:
         """See `Camera`."""
-        W, A = np.eye(POSE), turning(self.R_world_angles, self.x)
-        W[:3, 3:], W[3:, 3:] = hat(self.x[:3]) @ A, A
+        W, turn = np.eye(POSE), turning(self.R_world_angles, self.x)
+        W[:3, 3:], W[3:, 3:] = hat(self.x[:3]) @ turn, turn
         return W
 
     def moved(self, error: Array) -> EulerCamera:
@@ -93,11 +93,11 @@ class EulerCamera:
         """See `Camera`."""
         J = np.eye(CAMERA)
         if self.transports:
-            A, A_before = turning(self.R_world_angles, to.x), turning(self.R_world_angles, self.x)
+            turn, before = turning(self.R_world_angles, to.x), turning(self.R_world_angles, self.x)
             change = to.x - self.x
-            J[:3, 3:6] = -hat(change[:3]) @ A_before
-            J[3:6, 3:6] = np.linalg.solve(A, A_before)
-            J[6:9, 3:6] = -hat(change[6:9]) @ A_before
+            J[:3, 3:6] = -hat(change[:3]) @ before
+            J[3:6, 3:6] = np.linalg.solve(turn, before)
+            J[6:9, 3:6] = -hat(change[6:9]) @ before
         return J
 
     def advanced(self, dt: float) -> tuple[EulerCamera, Array, Array]:
@@ -122,9 +122,10 @@ class EulerCamera:
         """``x ← f(x)`` as printed, and A: as printed if the covariance is not transported.
 
         If the covariance is transported, the attitude's error is carried as a turn about the world's axes, not as one
-        of the angles φ. The printed transition has constant rates of the angles, which is not the same in another
-        world: with these A is no derivative of f, by what is of second order in a step. As printed, A is one, but the
-        covariance would shrink along turns of the world, which nothing measures, in every step.
+        of the angles φ, and the rates' error is that of the body's rate, in numbers of the angles' rates: a turn of the
+        world leaves it as it is. The printed transition has constant rates of the angles, which is not the same in
+        another world. As printed, A is the derivative of f, but the covariance would shrink along turns of the world,
+        which nothing measures, in every step.
         """
         x, A = self.x.copy(), np.eye(CAMERA)
         x[:POSE] += dt * self.x[POSE:]
@@ -166,7 +167,8 @@ class EulerCamera:
         G = inverse @ body_rate_matrix(phi)
         x[3:6], x[9:12] = new, G @ omega
         J[3:6, 3:6] = J[9:12, 9:12] = G
-        J[9:12, 3:6] = inverse @ (body_rate_derivative(phi, omega) - body_rate_derivative(new, x[9:12]) @ G)
+        if not self.transports:  # else the rates' error is that of the body's rate
+            J[9:12, 3:6] = inverse @ (body_rate_derivative(phi, omega) - body_rate_derivative(new, x[9:12]) @ G)
         return replace(self, x=x, R_world_angles=world), J
 
 

@@ -28,29 +28,26 @@ from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, b
 Search = Callable[[], "Array | None"]
 
 
-def agreement(update: Update, search: Search) -> Solution | None:
+def agreement(update: Update, guess: Array | None, search: Search) -> Solution | None:
     """Solve with the prior, or where it fails the pose, that most observations agree with; None where there is none.
 
-    Where less than a third of the observations agrees, and as many wrong ones might agree by chance, that agreement is
-    ignored: it could move the pose anywhere. `search` is only called where nothing else helps. Raises LinAlgError
-    where the reason is numerical.
+    It is linearised at the prior, then at the guess, a pose (4, 4), if there is one. Where less than a third of the
+    observations agrees, and as many wrong ones might agree by chance, that agreement is ignored: it could move the pose
+    anywhere. An agreement of a minority counts only if nothing else is found. `search` is only called where nothing
+    else helps. Raises LinAlgError where the reason is numerical.
     """
     if not (np.isfinite(update.camera.pose).all() and math.isfinite(update.covariance.P.trace())):
         raise LinAlgError("the predicted state is not finite")
     found, error, majority = None, None, (len(update.z) + 1) // 2
-    least = max(MIN_OBSERVATIONS, majority)  # what passes the gate; in the end `solve` takes out what disagrees
-    starts = [(None, least), (None, 0)] if update.guess is None else [(None, least), (update.guess, least), (None, 0)]
-    gates: dict[bool, Gated] = {}
-    for T, passing in starts:
+    for T in (None,) if guess is None else (None, guess):
         try:
-            gated = gates[T is None] = gates.get(T is None) or gate(update, T)
-            agreed = _agreed(gated) if gated.used.sum() >= passing else None
+            agreed = _agreed(gate(update, T))
         except LinAlgError as reason:  # another start may do
             error = reason
             continue
-        found = agreed or found
         if agreed is not None and agreed.used.sum() >= majority:
             return agreed
+        found = agreed or found
     found = _restarted(update, search, max(MIN_CONSENSUS, majority)) or found
     if found is None and error is not None:
         raise error

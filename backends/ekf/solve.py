@@ -15,7 +15,6 @@ from scipy.linalg.lapack import dpotrf
 
 from backends.ekf.covariance import CAMERA, POSE
 from backends.ekf.innovation import Linearisation, Solution, Update
-from slam.chi_square import chi_square_limits
 from slam.data import BoolArray
 from slam.geometry.se3 import Array
 from slam.window.gating import squared_distances
@@ -44,7 +43,7 @@ def gate(update: Update, T: Array | None = None) -> Gated:
     Raises LinAlgError where S is not positive definite.
     """
     at = update.linearised(None if T is None else update.camera.at(T))
-    limits = chi_square_limits(np.isfinite(update.z).sum(axis=1), update.measure.models.gate_probability)
+    limits = update.measure.limits(update.z)
     own = squared_distances(at.nu.reshape(-1, 3), _blocks(at.S))
     if not np.isfinite(own).all():
         raise LinAlgError("the predicted innovations are not finite or not positive definite")
@@ -58,11 +57,11 @@ def solve(gated: Gated) -> Solution | None:
     None where nothing is left. Raises LinAlgError where S or the pose's covariance is not positive definite, or the
     new state not finite.
     """
-    found, update = _twice(gated), gated.at.update
+    found, update = _with_readmitted(gated), gated.at.update
     if found is not None:
         faced = update.facing(found.camera.pose)
-        if faced.camera is not update.camera:  # the coordinates of its error are nearly singular there
-            found, update = _twice(gate(faced, faced.guess)), faced
+        if faced is not update:  # the coordinates of its error are nearly singular there
+            found, update = _with_readmitted(gate(faced, found.camera.pose)), faced
     if found is not None:
         root = found.by_pose
         if dpotrf(update.covariance.pose - root.T @ root, lower=1)[1] != 0:
@@ -70,7 +69,7 @@ def solve(gated: Gated) -> Solution | None:
     return found
 
 
-def _twice(gated: Gated) -> Solution | None:
+def _with_readmitted(gated: Gated) -> Solution | None:
     """With what passed the gate, and again where the solution predicts more."""
     found = _agreeing(gated, gated.used)
     if found is not None:
@@ -122,16 +121,14 @@ def _blocks(S: Array) -> Array:
 def _iterate(at: Linearisation, used: BoolArray) -> Solution:
     """An update by some landmarks (mask (M,)), first linearised as it is there, then at each solution (Gauss-Newton).
 
-    Where the first is not linear, the guess is the next place. One iteration is taken as it is: the papers' filter.
+    One iteration is taken as it is: the papers' filter.
     What comes to lie behind the camera counts no more. Without the transport of the covariance this ends at the maximum
     of the posterior. With it H leaves out what would measure the gauge, and the end is off that by what is of second
     order in a step.
     """
     update, found = at.update, None
-    for iteration in range(update.iterations):
-        if iteration == 1 and update.guess is not None:
-            at = update.linearised(update.camera.at(update.guess))
-        elif found is not None:
+    for _ in range(update.iterations):
+        if found is not None:
             at = update.linearised(found.camera, found.change[CAMERA:])
         used = used & at.seen.any(axis=1)
         found = at.solved(used)

@@ -14,16 +14,10 @@ from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
 
-_MOST, _LEAST = 300, 250  # cost: landmarks of the state above which some leave it, and that are left in it then
-
 
 @dataclass(frozen=True, eq=False)
 class FilterState:
-    """A camera and three coordinates per landmark, with the joint covariance of their errors.
-
-    The landmarks in it are those measured of late. Where there are too many, those not measured for longest leave it;
-    they stay where they are, and come back with their covariances when they are measured (`backends.ekf.covariance`).
-    """
+    """A camera and three coordinates per landmark, with the joint covariance of their errors."""
 
     stamp: float  # time [s]; NaN before the first prediction
     frame: int  # number of the prediction, −1 before the first
@@ -94,7 +88,7 @@ class FilterState:
         if not len(ids):
             return self
         R, anchors = self.pose[:3, :3], np.repeat(self.pose[None, :3], len(h), axis=0)
-        new = FilterLandmarks.at(coordinates, ids, anchors, self.pose[:3, 3] + h @ R.T, self.frame)
+        new = FilterLandmarks.at(coordinates, ids, anchors, self.pose[:3, 3] + h @ R.T)
         D = coordinates.inverse_jacobian(anchors, new.c) @ R
         noise = D @ covariances @ D.transpose(0, 2, 1)
         by_rig = np.zeros((len(h), 3, self.covariance.by_rig.shape[1])) if by_rig is None else D @ by_rig
@@ -118,33 +112,22 @@ class FilterState:
         return self._rearranged(*(part[stay[part]] for part in self._parts()))
 
     def with_all_of(self, ids: IdArray) -> FilterState:
-        """With some landmarks (M,), which may be parked or known from elsewhere, in the state."""
-        rows, (parked, state, known) = self.landmarks.rows_of(ids), self._parts()
-        back = np.sort(rows[(rows < len(parked)) | (rows >= len(parked) + len(state))])
-        if not len(back):
+        """With some landmarks (M,), which may be known from elsewhere, in the state."""
+        rows, (state, known) = self.landmarks.rows_of(ids), self._parts()
+        joining = np.sort(rows[rows >= len(state)])
+        if not len(joining):
             return self
-        return self._rearranged(np.setdiff1d(parked, back), np.concatenate([state, back]), np.setdiff1d(known, back))
+        return self._rearranged(np.concatenate([state, joining]), np.setdiff1d(known, joining))
 
-    def relieved(self) -> FilterState:
-        """Where the state is too large, without those not measured for longest."""
-        (parked, state, known), seen = self._parts(), self.landmarks.seen
-        if len(state) <= _MOST:
-            return self
-        old = state[seen[state] < self.frame]
-        leave = np.sort(old[np.argsort(seen[old], kind="stable")][: max(len(state) - _LEAST, 0)])
-        if not len(leave):
-            return self
-        return self._rearranged(np.concatenate([parked, leave]), np.setdiff1d(state, leave), known)
+    def _parts(self) -> tuple[IndexArray, IndexArray]:
+        """Rows of the landmarks that are in the state, and of those that are known from elsewhere."""
+        rows, count = np.arange(len(self.landmarks)), self.covariance.correlated
+        return rows[:count], rows[count:]
 
-    def _parts(self) -> tuple[IndexArray, IndexArray, IndexArray]:
-        """Rows of the landmarks that are parked (they have left the state), are in it, or are known from elsewhere."""
-        rows, a, b = np.arange(len(self.landmarks)), self.covariance.parked, self.covariance.correlated
-        return rows[:a], rows[a:b], rows[b:]
-
-    def _rearranged(self, parked: IndexArray, state: IndexArray, known: IndexArray) -> FilterState:
+    def _rearranged(self, state: IndexArray, known: IndexArray) -> FilterState:
         """With the landmarks of these rows of the table in each part."""
-        landmarks = self.landmarks.select(np.concatenate([parked, state, known]))
-        return replace(self, landmarks=landmarks, covariance=self.covariance.rearranged(parked, state, known))
+        landmarks = self.landmarks.select(np.concatenate([state, known]))
+        return replace(self, landmarks=landmarks, covariance=self.covariance.rearranged(state, known))
 
     # --- updates ---
 
@@ -156,14 +139,12 @@ class FilterState:
         have measured such displacements, in time very well (Huang, Mourikis and Roumeliotis, 2010). So the error is
         taken apart: into the displacement of the world that the camera's pose is off by, written in the corrected
         state's coordinates, and what it leaves, which stays as it is. That is the error of an invariant filter (Barrau
-        and Bonnabel, 2015). Parked landmarks do not move: their coordinates need no transport. Raises LinAlgError where
-        the new state is not finite, or a variance is lost in rounding.
+        and Bonnabel, 2015). Raises LinAlgError where the new state is not finite, or a variance is lost in rounding.
         """
         update, camera = found.at.update, found.camera
-        marks = self.landmarks.moved(update.coordinates, self._parts()[1], found.change[CAMERA:].reshape(-1, 3))
+        marks = self.landmarks.moved(update.coordinates, self._parts()[0], found.change[CAMERA:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise LinAlgError("the corrected state is not finite")
-        marks.seen[update.rows[found.used]] = self.frame
         J, shift = update.camera.transport(camera), self._shift(marks, camera)
         covariance = update.covariance.corrected(*found.gain_root(), J, shift)
         if not (covariance.P.diagonal()[HEAD:] > 0).all():
@@ -184,6 +165,6 @@ class FilterState:
         return replace(s, landmarks=marks, covariance=covariance)
 
     def _shift(self, marks: FilterLandmarks, camera: Camera) -> Array:
-        """What is added to the errors (A, 3, 6) of landmarks that have moved, by the error of the pose."""
-        change = (marks.gauge - self.landmarks.gauge)[self._parts()[1]]
+        """What is added to the errors (N, 3, 6) of landmarks that have moved, by the error of the pose."""
+        change = (marks.gauge - self.landmarks.gauge)[self._parts()[0]]
         return np.asarray(change @ camera.displacement() if camera.transports else np.zeros_like(change))

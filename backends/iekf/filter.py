@@ -13,7 +13,8 @@ other derivatives do depend on the estimate.
 
 The covariance is kept in the state's own coordinates here: ``[δp, θ, δv, δω]`` with ``R = Exp(θ) R̂``, and the
 landmarks' inverse depths, with ``ξ = T(χ̂) [δp, θ, …]``. An update that moves the estimate from χ̂ to χ̂⁺ multiplies them
-by ``T(χ̂⁺)⁻¹ T(χ̂)``, so that P_ξ stays: the transport of `backends.ekf.state.FilterState.corrected`.
+by ``T(χ̂⁺)⁻¹ T(χ̂)``: the transport of `backends.ekf.state.FilterState.corrected`. So the camera's ξ stays, to first
+order in a step; what a landmark's has besides the displacement keeps its numbers in inverse depth.
 """
 
 from __future__ import annotations

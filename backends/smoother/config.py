@@ -14,7 +14,7 @@ class SmootherConfig:
 
     Attributes:
         track: most poses that a smart factor spans; a landmark that is measured for longer continues in a new one. With
-            a lag, a factor ends before its first pose leaves.
+            a lag, no more than the lag and one: a factor ends before its first pose leaves.
         lag: number of poses before the newest one that are smoothed with it; older ones are marginalised, so that
             neither time nor memory grows with the run. Null (in Python None) keeps all and revises the whole path.
         landmarks: most landmarks that are variables of the graph. Where a frame measures no more than these, those that

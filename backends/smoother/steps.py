@@ -130,10 +130,6 @@ class Steps(RectifiedMeasurement):
         marks = replace(marks, by_rig=marks.by_rig.copy())
         own = marks.from_newest[seen]
         marks.by_rig[seen] = _landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
-        if unknown_turn(s.own):
-            P = _in_world(s, found.T, np.zeros((6, 6)), np.linalg.inv(one.information + G.T @ G))
-            P = world_covariance(s.spread[-1]) if marks.world[seen].any() else P
-            return self._anew(s, graph, found.T, P, seen, z[used])
         known = np.linalg.eigvals(np.linalg.solve(one.information, G.T @ G)).real.min() > 1  # better than the motion
         if self.config.poses == "seen" and known and self._saw_the_same(s, marks.serial[seen]):
             return _aside(s, found.T, G.T @ G, by_rig), nis, ""

@@ -8,7 +8,6 @@ import numpy as np
 
 from backends.window.slide import problem, slid
 from backends.window.state import WindowConfig, WindowLandmarks, WindowState
-from slam.chi_square import chi_square_limits
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.arrays import among, changed
 from slam.geometry.kernels import seen
@@ -159,7 +158,7 @@ class Steps(RectifiedMeasurement):
             s = _restarted(s, found.T, points)
             before = s.rows
         poses = np.concatenate([s.poses[:-1], found.T[None]])
-        limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.models.gate_probability)
+        limits = self.limits(z)
         s = changed(s, poses=poses, rows=before.joined(self._rows(s, points[used], z[used])))
         w = changed(problem(s, self.stereo), asked=among(len(s.landmarks), points[used]))
         fresh = unknown_turn(s.covariance[-6:, -6:])

@@ -5,8 +5,8 @@ import numpy as np
 from slam.worlds.geometry import DOWN, RIGHT, Parts, rectangle
 from slam.worlds.options import Option
 from slam.worlds.paths import camera_poses, clock
-from slam.worlds.scenes import Scene
 from slam.worlds.surfaces import Material
+from slam.worlds.world import Scene
 
 
 def build(values):

@@ -5,7 +5,6 @@ import numpy as np
 from slam.data import Estimate, Prediction, UpdateReport, UpdateStatus
 from slam.geometry.rig import measurement_rows
 from slam.geometry.se3 import inverse, transform
-from slam.geometry.trajectory import Trajectory
 from slam.guarded import guarded
 from slam.window.consensus import find_consensus
 
@@ -15,11 +14,10 @@ class PoseFit:
     def __init__(self, rig, models):
         self.rig, self.models = rig, models
         self.T, self.P = models.initial_pose, 1e-4 * np.eye(6)  # T_world_left, and its covariance: guessed
-        self.points, self.stamps, self.poses = {}, [], []
+        self.points, self.stamp = {}, None
 
     def predict(self, stamp):
-        self.stamps.append(stamp)
-        self.poses.append(self.T)  # the camera stays where it is: no model of motion
+        self.stamp = stamp  # the camera stays where it is: no model of motion
         ids = np.array(sorted(self.points), np.int64)
         local = transform(inverse(self.T), self.positions(ids))
         view = self.rig.left.in_view(local)
@@ -34,7 +32,7 @@ class PoseFit:
         measured = measurement_rows(seen.uv_left, seen.uv_right)
         start = self.T if guess is None else guess
         found = find_consensus(self.rig, self.positions(seen.ids), measured, start, 4 * sigma, 64, seed=0)
-        self.T = self.poses[-1] = found.T_world_left
+        self.T = found.T_world_left
         used, rejected = seen.ids[found.inliers], seen.ids[~found.inliers]
         return UpdateReport(UpdateStatus.OK, "", used, rejected, float("nan"), 0)
 
@@ -52,7 +50,4 @@ class PoseFit:
     def estimate(self, landmarks=True):
         ids = np.array(sorted(self.points) if landmarks else [], np.int64)
         spread = np.tile(0.01 * np.eye(3), (len(ids), 1, 1))
-        return Estimate(self.stamps[-1], self.T, self.P, ids, self.positions(ids), spread)
-
-    def trajectory(self):
-        return Trajectory(np.array(self.stamps), np.array(self.poses).reshape(-1, 4, 4))
+        return Estimate(self.stamp, self.T, self.P, ids, self.positions(ids), spread)

@@ -1,88 +1,70 @@
 """A whole back end: an extended Kalman filter of the camera's pose and velocity and of all landmarks."""
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from slam.chi_square import chi_square_limit
 from slam.data import Estimate, Prediction, UpdateReport, UpdateStatus
-from slam.geometry.rig import measurement_rows
+from slam.geometry.arrays import LandmarkRows
 from slam.geometry.se3 import adjoint, exp, inverse, points_by_pose, transform
-from slam.geometry.trajectory import Trajectory
 from slam.guarded import guarded
+from slam.window.gating import squared_distances
+from slam.window.motion import velocity_sigmas
+from slam.window.stereo import RectifiedMeasurement
 
 
 @guarded
 class SmallFilter:
     def __init__(self, rig, models):
-        self.rig, self.models, self.T, self.rate = rig, models, models.initial_pose, np.zeros(6)
-        pose, rates = ("rotation", "position"), ("angular_velocity", "velocity")
-        sigmas = [getattr(models, f"initial_{what}_sigma") for what in (*pose, *rates)]
-        self.P = np.diag(np.repeat(sigmas, 3) ** 2)  # of [turn, shift] and their rates, in camera axes, then of points
-        self.points, self.ids, self.stamps, self.poses = np.zeros((0, 3)), np.zeros(0, np.int64), [], []
+        self.measure, self.map = RectifiedMeasurement(rig, models), LandmarkRows(np.zeros(0, np.int64))
+        self.stamp, self.T, self.rate, self.points = np.nan, models.initial_pose, np.zeros(6), np.zeros((0, 3))
+        sigmas = [models.initial_rotation_sigma, models.initial_position_sigma, 0, 0]
+        self.P = np.diag(np.repeat(sigmas, 3) ** 2)  # of [turn, shift], of their rates, and of points in the world
 
-    def _rows(self, ids):
-        return np.flatnonzero(ids[:, None] == self.ids) % max(len(self.ids), 1)
+    def seen(self, rows):  # landmarks as seen from the camera (M, 3), and their derivatives (M, 3, n)
+        local, R_left_world = transform(inverse(self.T), self.points[rows]), self.T[:3, :3].T
+        by_pose, by_points = points_by_pose(local).reshape(-1, 6), np.kron(np.eye(len(self.points))[rows], R_left_world)
+        return local, np.hstack([by_pose, 0 * by_pose, by_points]).reshape(len(rows), 3, len(self.P))
 
-    def _expected(self, rows):  # pixels (uL, vL, uR) of landmarks, their derivatives, and covariances with noise
-        h, n, R = transform(inverse(self.T), self.points[rows]), np.arange(len(rows)), self.T[:3, :3]
-        z, J = self.rig.project_stereo(h)
-        H = np.zeros((len(rows), 3, len(self.P)))
-        H[:, :, :6] = J @ points_by_pose(h)
-        for k in range(3):
-            H[n, :, 12 + 3 * rows + k] = J @ R[k]
-        return z, H, H @ self.P @ H.transpose(0, 2, 1) + self.models.pixel_sigma**2 * np.eye(3)
-
-    def predict(self, stamp):
-        if self.stamps:  # constant velocity, disturbed by impulses
-            dt, F = stamp - self.stamps[-1], np.eye(len(self.P))
-            step, W = exp(dt * self.rate), np.concatenate([dt * np.eye(6), np.eye(6)])
-            F[:6, :6], F[:6, 6:12] = adjoint(inverse(step)), dt * np.eye(6)
-            self.T, self.P = self.T @ step, F @ self.P @ F.T
-            self.P[:12, :12] += W * np.repeat(self.models.motion.velocity_variance(dt)[::-1], 3) @ W.T
-        self.stamps, self.poses = [*self.stamps, stamp], [*self.poses, self.T]
-        rows = np.flatnonzero(self.rig.left.in_view(transform(inverse(self.T), self.points)))
-        z, _, S = self._expected(rows)
-        return Prediction(stamp, self.T, self.P[:6, :6], self.ids[rows], z[:, :2], z[:, [2, 1]], S[:, :2, :2])
+    def predict(self, stamp):  # an impulse changes the velocity, which then stays; the first frame moves nothing
+        dt, F = np.nan_to_num(stamp - self.stamp), np.eye(len(self.P))
+        F[:6, :12] = np.hstack([adjoint(exp(-dt * self.rate)), dt * np.eye(6)])
+        self.P[6:12, 6:12] += np.diag(velocity_sigmas(self.measure.models, dt, np.isnan(self.stamp)) ** 2)
+        self.stamp, self.T, self.P = stamp, self.T @ exp(dt * self.rate), F @ self.P @ F.T
+        rows = self.measure.visible(self.T, self.points)
+        local, A = self.seen(rows)
+        pixels = self.measure.pixels(local, A @ self.P @ A.transpose(0, 2, 1))
+        return Prediction(stamp, self.T, self.P[:6, :6], self.map.ids[rows], *pixels)
 
     def update(self, observations, guess=None):
-        ids, (z, H, S) = observations.ids, self._expected(self._rows(observations.ids))
-        nu = measurement_rows(observations.uv_left, observations.uv_right) - z
-        there = np.isfinite(nu)  # a right pixel may be missing
-        nu, H = np.where(there, nu, 0.0), np.where(there[:, :, None], H, 0.0)
-        distances = np.einsum("ni,ni->n", nu, np.linalg.solve(S, nu[:, :, None])[:, :, 0])
-        good = there[:, 0] & (distances < chi_square_limit(3, self.models.gate_probability))
-        if not good.any():
-            return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was seen where it is expected", ids)
-        H, nu = H[good][there[good]], nu[good][there[good]]
-        S = H @ self.P @ H.T + self.models.pixel_sigma**2 * np.eye(len(H))
+        ids, variance = observations.ids, self.measure.models.pixel_sigma**2
+        local, A = self.seen(self.map.rows_of(ids))
+        h, D = self.measure.stereo.project(local)
+        nu, H = self.measure.stereo.measure(observations) - h, D @ A
+        distances = squared_distances(nu, H @ self.P @ H.transpose(0, 2, 1) + variance * np.eye(3))
+        good = distances <= self.measure.limits(nu)
+        there = good[:, None] & np.isfinite(nu)  # a right pixel may be missing
+        nu, H = nu[there], H[there]
+        S = H @ self.P @ H.T + variance * np.eye(len(H))
         K = np.linalg.solve(S, H @ self.P).T
         x, P = K @ nu, self.P - K @ S @ K.T
         self.T, self.rate, self.P = self.T @ exp(x[:6]), self.rate + x[6:12], 0.5 * (P + P.T)
-        self.points, self.poses = self.points + x[12:].reshape(-1, 3), [*self.poses[:-1], self.T]
-        return UpdateReport(UpdateStatus.OK, "", ids[good], ids[~good], float(nu @ np.linalg.solve(S, nu)), len(nu))
+        self.points = self.points + x[12:].reshape(-1, 3)
+        return UpdateReport(UpdateStatus.OK, "", ids[good], ids[~good], nu @ np.linalg.solve(S, nu), len(nu))
 
     def add(self, observations):
-        h, R, n = self.rig.triangulate(observations.uv_left, observations.uv_right), self.T[:3, :3], len(self.P)
-        A = np.eye(n + 3 * len(h), n)
-        A[n:, :6] = -(R @ points_by_pose(h)).reshape(-1, 6)
-        self.P = A @ self.P @ A.T
-        for i, C in enumerate(R @ self.rig.triangulation_covariance(h, self.models.pixel_sigma) @ R.T):
-            self.P[n + 3 * i : n + 3 * i + 3, n + 3 * i : n + 3 * i + 3] += C
-        self.points = np.concatenate([self.points, transform(self.T, h)])
-        self.ids = np.concatenate([self.ids, observations.ids])
+        local, noise, _ = self.measure.first_sight(observations.ids, self.measure.stereo.measure(observations))
+        R, J = self.T[:3, :3], np.eye(len(self.P) + 3 * len(local), len(self.P))
+        J[len(self.P) :, :6] = -(R @ points_by_pose(local)).reshape(-1, 6)
+        self.P = J @ self.P @ J.T + block_diag(0 * self.P, *(R @ noise @ R.T))
+        self.points = np.concatenate([self.points, transform(self.T, local)])
+        self.map = self.map.joined(LandmarkRows(observations.ids))
 
     def remove(self, ids):
-        stay = ~np.isin(self.ids, ids)
-        numbers = np.flatnonzero(np.append(np.ones(12, bool), np.repeat(stay, 3)))
-        self.P, self.points, self.ids = self.P[np.ix_(numbers, numbers)], self.points[stay], self.ids[stay]
-
-    def positions(self, ids):
-        return self.points[self._rows(ids)]
+        stay = ~np.isin(self.map.ids, ids)
+        kept = np.append(np.full(12, True), np.repeat(stay, 3))
+        self.P, self.points, self.map = self.P[kept][:, kept], self.points[stay], self.map.select(stay)
 
     def estimate(self, landmarks=True):
-        rows = np.argsort(self.ids) if landmarks else np.zeros(0, np.intp)
-        i = 12 + 3 * rows[:, None] + np.arange(3)
-        blocks = self.P[i[:, :, None], i[:, None, :]]
-        return Estimate(self.stamps[-1], self.T, self.P[:6, :6], self.ids[rows], self.points[rows], blocks)
-
-    def trajectory(self):
-        return Trajectory(np.array(self.stamps), np.array(self.poses).reshape(-1, 4, 4))
+        rows, n = self.map.order if landmarks else [], len(self.points)
+        blocks = self.P[12:, 12:].reshape(n, 3, n, 3)[rows, :, rows]
+        return Estimate(self.stamp, self.T, self.P[:6, :6], self.map.ids[rows], self.points[rows], blocks)

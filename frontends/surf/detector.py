@@ -203,45 +203,38 @@ def _collect(space, pixels, stride, filters, layer, row, out, found):
     return found
 
 
-def _column_phases(integral: NDArray[np.int32], step: int, first: int, last: int) -> NDArray[np.int32]:
-    """Columns of an integral image by their remainder, ``out[p, y, j] = integral[y, step * j + p]``, of some rows.
+@helper
+def _column_phases(pixels, stride, shape, first, last, out):
+    """Columns of a flat integral image by their remainder, ``out[p, y, j] = integral[y, step * j + p]``, of some rows.
 
-    A filter that moves in steps of `step` then reads neighbouring memory.
+    A filter that moves in steps of `step` then reads neighbouring memory. `out`, flat too, is of shape (step, rows, n).
     """
-    rows, columns = integral.shape
-    if step == 1:
-        return integral[None]
-    out = np.empty((step, rows, -(-columns // step)), np.int32)
+    step, rows, n = shape
     for p in range(step):
-        phase = integral[first:last, p::step]
-        out[p, first:last, : phase.shape[1]] = phase
-    return out
-
-
-def detect_octave(
-    integral: NDArray[np.int32], filters: Filters, octave: int, threshold: float, first_row: int, last_row: int
-) -> NDArray[np.float64]:
-    """Candidates (N, COLUMNS) above a threshold in an octave, from a grid row to before another, in raster order."""
-    top, bottom = first_row - 1 - filters.centre[-2], last_row + 1 + filters.centre[-2]  # that inner layers read
-    phases = _column_phases(integral, filters.step, max(top, 0) * filters.step, (bottom + 1) * filters.step)
-    found = _scan(integral, phases, filters, np.float32(threshold), first_row, last_row)
-    found[:, 5] = octave
-    return found
+        for y in range(first, last):
+            for j in range((stride - p + step - 1) // step):
+                out[np.uint64((p * rows + y) * n + j)] = pixels[np.uint64(y * stride + step * j + p)]
 
 
 @kernel
-def _scan(integral, phases, filters, threshold, first_row, last_row):
-    """The search itself; the octave is not filled in."""
+def detect_octave(integral, filters, octave, threshold, first_row, last_row):
+    """Candidates (N, COLUMNS) above a threshold in an octave, from a grid row to before another, in raster order."""
     step, height, width, stride = filters.step, integral.shape[0] - 1, integral.shape[1] - 1, integral.shape[1]
     rows, columns, inner = height // step, width // step, len(filters.sizes) - 2
+    pixels = phases = integral.reshape(-1)
+    shape = step, height + 1, -(-stride // step)
+    if step > 1:
+        phases = np.empty(shape[0] * shape[1] * shape[2], np.int32)
+        reach = filters.centre[inner] + 1  # rows above and below that inner layers read
+        first, last = max(first_row - reach, 0) * step, min((last_row + reach + 1) * step, height + 1)
+        _column_phases(pixels, stride, shape, first, last, phases)
     ring = np.zeros((inner, 3, columns + 1), np.float32)  # three rows of each layer; row i lies in slot i % 3
     words = np.zeros((columns + 7) // 8, np.uint64)
-    buffer, responses, mask = np.empty(3 * step * phases.shape[2], np.int32), ring.reshape(-1), words.view(np.uint8)
+    buffer, responses, mask = np.empty(3 * step * shape[2], np.int32), ring.reshape(-1), words.view(np.uint8)
     slots = np.empty(3, np.int64)
     space = buffer, ring, responses, words, mask, slots, np.empty((3, 3, 3)), np.empty((3, 3)), np.empty(3)
     # At most one strict maximum in each 2x2 block of a layer.
     out = np.empty((max(16, (last_row - first_row + 2) * (columns + 1) // 4 * inner), COLUMNS))
-    pixels, phases_shape, phases = integral.reshape(-1), phases.shape, phases.reshape(-1)
     found = np.int64(0)
     for i in range(max(0, first_row - 1), min(rows, last_row + 1)):
         for layer in range(1, inner + 1):
@@ -250,7 +243,7 @@ def _scan(integral, phases, filters, threshold, first_row, last_row):
                 to = np.uint64((3 * (layer - 1) + i % 3) * ring.shape[2] + start)
                 count = 1 + (width - size) // step
                 y0 = step * (i - start)
-                _response_row(phases, phases_shape, filters, layer, y0, buffer, count, responses, to)
+                _response_row(phases, shape, filters, layer, y0, buffer, count, responses, to)
         row = i - 1
         slots[0], slots[1], slots[2] = (row - 1) % 3, row % 3, i % 3
         for layer in range(1, inner + 1):
@@ -268,4 +261,6 @@ def _scan(integral, phases, filters, threshold, first_row, last_row):
                 rival, threshold, mask[a:b],
             )  # fmt: skip
             found = _collect(space, pixels, stride, filters, layer, row, out, found)
+    for k in range(found):  # a slice would take longer to compile
+        out[k, 5] = octave
     return out[:found].copy()

@@ -12,20 +12,20 @@ from slam.runtime.compilation import helper, kernel, vector_helper
 _HALF = 4  # fixed: half width of the compared patches [half-resolution px]; the kernel's inner loop is written for it
 _SIDE = 2 * _HALF + 1
 _FLAT = 2.0  # least standard deviation of a patch [grey levels of 8-bit images]
-_LANES = 16  # cost: columns are searched in whole vector registers
-_PADDED = (_SIDE * _SIDE + _LANES - 1) // _LANES * _LANES  # pixels of a patch by rows, padded with zeros
+_LANES = 16  # cost: columns are searched in whole vector registers, in which a row of a patch is kept too
 _CONTENDER = 0.7  # cost: a column no more alike than this share of what a rival needs has none beside it
 _NEIGHBOURS = 2  # columns about the best place that are no rivals of it
+#: 1 at a patch's columns, 0 in the rest of a register. As an argument its length is not known when compiling: the loops
+#: over it would be unrolled instead of running on vector registers.
+ROW = np.float32(np.arange(_LANES) < _SIDE)
 
 
 class _Space(NamedTuple):
-    """Work space of the search: for patches by rows, padded with zeros, and the places along a row."""
+    """Work space of the search."""
 
-    patch: NDArray[np.float32]  # what is looked for, its mean removed
-    pixels: NDArray[np.float32]  # the patch at a place
-    between: NDArray[np.float32]  # and half a column beside it
-    side: int  # of a patch; no constant here, or its loops would be unrolled instead of running on vector registers
-    scores: NDArray[np.float32]  # correlations with the places
+    row: NDArray[np.float32]  # `ROW`
+    patch: NDArray[np.float32]  # what is looked for by rows, each padded with zeros, its mean removed
+    scores: NDArray[np.float32]  # correlations with the places along a row
 
 
 class HalfImage(NamedTuple):
@@ -37,76 +37,82 @@ class HalfImage(NamedTuple):
     between: NDArray[np.float32]  # grey values half a column further to the right
 
 
-def half_image(image: NDArray[np.float32], scale: float) -> HalfImage:
-    """Halve an image (H, W), brought to 0..255 by `scale`; an odd last row or column is left out."""
-    import cv2
-
-    rows, columns = max(image.shape[0] // 2, 1), max(image.shape[1] // 2, 1)
-    flat = np.zeros((3, rows * columns + _LANES), np.float32)
-    pixels, weight, between = (plane[: rows * columns].reshape(rows, columns) for plane in flat)
-    if min(rows, columns) >= _SIDE:
-        image, mean = image[: 2 * rows] if scale == 1 else np.float32(scale) * image[: 2 * rows], cv2.INTER_AREA
-        cv2.resize(image[:, : 2 * columns], (columns, rows), pixels, interpolation=mean)
-        between[:, :-1] = cv2.resize(image[:, 1 : 2 * columns - 1], (columns - 1, rows), interpolation=mean)
-        between[:, -1] = 0.25 * (image[::2, 2 * columns - 1] + image[1::2, 2 * columns - 1])
-        between[:, -1] += 0.25 * (image[::2, -1] + image[1::2, -1])
-        _weigh(pixels, np.empty((2, columns), np.float32), weight)
-    return HalfImage((rows, columns), *flat)
+@vector_helper
+def _halve(grey, scale, y, columns, pixels, half, between):
+    """Two rows of an image as float32 pixels and, brought to 0..255, as row y at half resolution."""
+    to, last, quarter = np.uint64(y * columns), grey.shape[1] - 1, np.float32(0.25) * scale
+    for x in range(grey.shape[1]):
+        pixels[2 * y, x], pixels[2 * y + 1, x] = np.float32(grey[2 * y, x]), np.float32(grey[2 * y + 1, x])
+    for x in range(columns):
+        a, b = pixels[2 * y, 2 * x] + pixels[2 * y, 2 * x + 1], pixels[2 * y + 1, 2 * x] + pixels[2 * y + 1, 2 * x + 1]
+        half[to + np.uint64(x)] = quarter * (a + b)
+    for x in range(columns):
+        k, right = 2 * x + 1, min(2 * x + 2, last)
+        a, b = pixels[2 * y, k] + pixels[2 * y, right], pixels[2 * y + 1, k] + pixels[2 * y + 1, right]
+        between[to + np.uint64(x)] = quarter * (a + b)
 
 
 @vector_helper
-def _column_sums(pixels, y, sums):
+def _column_sums(pixels, y, columns, sums, squares):
     """Sums of pixels and of their squares over the patch rows about row y, less a middle grey to keep digits."""
     grey = np.float32(128.0)
-    for x in range(sums.shape[1]):
+    for x in range(columns):
         s, q = np.float32(0.0), np.float32(0.0)
         for r in range(_SIDE):
-            v = pixels[y - _HALF + r, x] - grey
+            v = pixels[np.uint64((y - _HALF + r) * columns) + np.uint64(x)] - grey
             s += v
             q += v * v
-        sums[0, x], sums[1, x] = s, q
+        sums[x], squares[x] = s, q
 
 
 @vector_helper
-def _row_weights(sums, weight, y):
+def _row_weights(sums, squares, y, columns, weight):
     area, zero = np.float32(_SIDE * _SIDE), np.float32(0.0)
-    least = np.float32(_FLAT * _FLAT) * area
-    for x in range(sums.shape[1] - 2 * _HALF):
+    least, to = np.float32(_FLAT * _FLAT) * area, np.uint64(y * columns + _HALF)
+    for x in range(columns - 2 * _HALF):
         s, q = zero, zero
         for c in range(_SIDE):
-            s += sums[0, x + c]
-            q += sums[1, x + c]
+            s += sums[x + c]
+            q += squares[x + c]
         spread = q - s * s / area
-        weight[y, x + _HALF] = np.float32(1.0) / np.sqrt(spread) if spread > least else zero
+        weight[to + np.uint64(x)] = np.float32(1.0) / np.sqrt(spread) if spread > least else zero
 
 
 @kernel
-def _weigh(pixels, sums, weight):
-    """The weights of a `HalfImage`; `sums` is work space."""
-    for y in range(_HALF, len(pixels) - _HALF):
-        _column_sums(pixels, y, sums)
-        _row_weights(sums, weight, y)
+def float_images(grey, scale):
+    """A grey image (H, W) in float32, and the parts of a `HalfImage` of it, brought to 0..255 by `scale`.
 
-
-@vector_helper
-def _cut(pixels, stride, x, y, side, out):
-    for r in range(_SIDE):
-        start, to = np.uint64((y - _HALF + r) * stride + x - _HALF), np.uint64(r * _SIDE)
-        for c in range(side):
-            out[to + np.uint64(c)] = pixels[start + np.uint64(c)]
+    An odd last row or column is left out there.
+    """
+    rows, columns = grey.shape[0] // 2, grey.shape[1] // 2
+    pixels, size = np.empty(grey.shape, np.float32), rows * columns + _LANES
+    half, weight, between = np.zeros(size, np.float32), np.zeros(size, np.float32), np.zeros(size, np.float32)
+    sums, squares = np.empty(columns, np.float32), np.empty(columns, np.float32)
+    for y in range(rows):
+        _halve(grey, scale, y, columns, pixels, half, between)
+    for y in range(2 * rows, grey.shape[0]):
+        for x in range(grey.shape[1]):
+            pixels[y, x] = np.float32(grey[y, x])
+    for y in range(_HALF, rows - _HALF):
+        _column_sums(half, y, columns, sums, squares)
+        _row_weights(sums, squares, y, columns, weight)
+    return pixels, (rows, columns), half, weight, between
 
 
 @vector_helper
 def _take_patch(pixels, stride, x, y, space):
     """Look for the patch about a pixel of a flat image, its mean removed."""
-    patch, n = space.patch, space.side * space.side
-    _cut(pixels, stride, x, y, space.side, patch)
-    total = np.float32(0.0)
-    for k in range(n):
-        total += patch[k]
+    row, patch, total = space.row, space.patch, np.float32(0.0)
+    at = np.uint64((y - _HALF) * stride + x - _HALF)
+    for c in range(len(row)):
+        k = np.uint64(c)
+        for r in range(_SIDE):
+            total += row[k] * pixels[at + np.uint64(r * stride) + k]
     mean = total / np.float32(_SIDE * _SIDE)
-    for k in range(n):
-        patch[k] -= mean
+    for c in range(len(row)):
+        k = np.uint64(c)
+        for r in range(_SIDE):
+            patch[np.uint64(r * _LANES) + k] = row[k] * (pixels[at + np.uint64(r * stride) + k] - mean)
 
 
 @vector_helper
@@ -118,7 +124,7 @@ def _correlate(image, stride, y, first, count, own, space):
         scores[j] = np.float32(0.0)
     for r in range(_SIDE):
         start = np.uint64((y - _HALF + r) * stride + first - _HALF)
-        n = r * _SIDE
+        n = r * _LANES
         w0, w1, w2, w3, w4 = patch[n], patch[n + 1], patch[n + 2], patch[n + 3], patch[n + 4]
         w5, w6, w7, w8 = patch[n + 5], patch[n + 6], patch[n + 7], patch[n + 8]
         for j in range(count):
@@ -155,17 +161,21 @@ def _height(image, stride, y, x, own, score, side, space):
     correlates with that by the root of ``(s² - 2 alike s n + n²) / (1 - alike²)`` at best, if that lies between them.
     """
     zero, one, area = np.float32(0.0), np.float32(1.0), np.float32(_SIDE * _SIDE)
-    patch, pixels, between = space.patch, space.pixels, space.between
-    _cut(image.pixels, stride, x, y, space.side, pixels)
-    _cut(image.between, stride, x + (side - 1) // 2, y, space.side, between)
+    row, patch = space.row, space.patch
+    at = np.uint64((y - _HALF) * stride + x - _HALF)
+    beside = at - np.uint64(1) if side < 0 else at
     sa, sb, bb, ab, product = zero, zero, zero, zero, zero
-    for k in range(patch.size):
-        a, b = pixels[k], between[k]
-        sa += a
-        sb += b
-        bb += b * b
-        ab += a * b
-        product += patch[k] * b
+    for c in range(len(row)):
+        k = np.uint64(c)
+        for r in range(_SIDE):
+            below = np.uint64(r * stride) + k
+            a, b = image.pixels[at + below], image.between[beside + below]
+            inside = row[k] * b
+            sa += row[k] * a
+            sb += inside
+            bb += inside * b
+            ab += inside * a
+            product += patch[np.uint64(r * _LANES) + k] * b
     spread = bb - sb * sb / area
     if not spread > area * np.float32(_FLAT * _FLAT):
         return score
@@ -183,15 +193,14 @@ def _unresolved(image, stride, x, y, space):
 
     An eighth of the share of the variance about (x, y) that interpolation between whole columns leaves unexplained.
     """
-    pixels, between, inner = space.pixels, space.between, space.side - 1
-    _cut(image.pixels, stride, x, y, space.side, pixels)
-    _cut(image.between, stride, x, y, space.side, between)
-    s, ss, ee = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    for r in range(_SIDE):
-        for c in range(inner):
-            k = np.uint64(r * _SIDE) + np.uint64(c)
-            v = between[k]
-            e = v - np.float32(0.5) * (pixels[k] + pixels[k + np.uint64(1)])
+    row, (s, ss, ee) = space.row, (np.float32(0.0), np.float32(0.0), np.float32(0.0))
+    at = np.uint64((y - _HALF) * stride + x - _HALF)
+    for c in range(len(row) - 1):
+        k = np.uint64(c)
+        for r in range(_SIDE):
+            j = at + np.uint64(r * stride) + k
+            v = row[k + np.uint64(1)] * image.between[j]
+            e = v - row[k + np.uint64(1)] * np.float32(0.5) * (image.pixels[j] + image.pixels[j + np.uint64(1)])
             s += v
             ss += v * v
             ee += e * e
@@ -240,7 +249,7 @@ def _search(image, shape, band, y, first, last, own, limits, space):
 
 
 @kernel
-def search_rows(left, right, uv, low, high, band, min_correlation, uniqueness):
+def search_rows(left, right, uv, low, high, band, min_correlation, uniqueness, row):
     """Right positions (N, 2) of left features to a pixel or two, by correlation along rows; NaN where there is none.
 
     A place counts where it correlates with at least `min_correlation`, clearly better than any rival (ratio ``(1 -
@@ -252,10 +261,7 @@ def search_rows(left, right, uv, low, high, band, min_correlation, uniqueness):
     low, high = 0.5 * low, 0.5 * high
     height, width = left.shape
     least, most = np.float32(min_correlation), np.float32(uniqueness)
-    space = _Space(
-        np.zeros(_PADDED, np.float32), np.zeros(_PADDED, np.float32), np.zeros(_PADDED, np.float32), _SIDE,
-        np.empty(width + _LANES, np.float32),
-    )  # fmt: skip
+    space = _Space(row, np.empty(_SIDE * _LANES, np.float32), np.empty(width + _LANES, np.float32))
     for i in range(len(uv)):
         px, py = 0.5 * (uv[i, 0] - 0.5), 0.5 * (uv[i, 1] - 0.5)
         x, y = int(np.rint(px)), int(np.rint(py))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from frontends.surf.config import SurfConfig
 from frontends.surf.correlation import align, cut_patches, patch_windows
-from frontends.surf.epipolar import search_rows
+from frontends.surf.epipolar import ROW, search_rows
 from frontends.surf.images import Picture, following_white, grey
 from frontends.surf.keypoints import Keypoints, adapted_threshold, spread
 from frontends.surf.surf import Surf
@@ -62,7 +62,7 @@ class SurfFrontend:
         given = [frame.left] if frame.right is None else [frame.left, frame.right]
         given = [self._checked(frame, image, side) for side, image in enumerate(given)]
         self._white = white = following_white(given[0], self._white)
-        tasks = [partial(self._picture, image, k, white, len(given) > 1) for k, image in enumerate(given)]
+        tasks = [partial(self._picture, image, k, white) for k, image in enumerate(given)]
         left, *right = self._surf.workers.run(tasks)
         keypoints, threshold = self._detect(left)
         keypoints = self._spread(keypoints, int(_CHOICE * self.config.features))
@@ -79,7 +79,7 @@ class SurfFrontend:
         features = StereoFeatures(
             frame.stamp, uv, uv_right, size, np.zeros(len(uv)) if self.config.upright else angle, keypoints.response,
             keypoints.laplacian, descriptors, threshold,
-            ImagePair(left.pixels, right[0].pixels if right else None), rectified=True,
+            ImagePair(left.floats[0], right[0].floats[0] if right else None), rectified=True,
         )  # fmt: skip
         return features if np.isfinite(angle).all() else features.select(np.isfinite(angle))
 
@@ -112,10 +112,10 @@ class SurfFrontend:
             )
         return image
 
-    def _picture(self, image: NDArray, side: int, white: float, paired: bool) -> Picture:
+    def _picture(self, image: NDArray, side: int, white: float) -> Picture:
         """The image of the left (0) or right (1) camera, rectified, with what is needed of it."""
         picture = Picture(self._rectify(image, side), white)
-        _ = picture.pixels, picture.half if paired else None
+        _ = picture.floats
         return picture
 
     def _rectify(self, image: NDArray, side: int) -> NDArray:
@@ -156,8 +156,9 @@ class SurfFrontend:
         shift, product = rectified.left.u0 - rectified.right.u0, rectified.left.fu * rectified.baseline
         low, high = product / c.max_depth + shift, product / c.min_depth + shift
         band = max(int(np.rint(0.5 * (c.epipolar - _OWN_BAND))), 0)
-        start = search_rows(left.half, right.half, uv, low, high, band, _COARSE * _CORRELATION, _UNIQUENESS)
-        found = self._refine(left.pixels, right.pixels, uv, size, start)
+        (pixels, half), (pixels_right, half_right) = left.floats, right.floats
+        start = search_rows(half, half_right, uv, low, high, band, _COARSE * _CORRELATION, _UNIQUENESS, ROW)
+        found = self._refine(pixels, pixels_right, uv, size, start)
         disparity = uv[:, 0] - found[:, 0]
         off_line = np.abs(found[:, 1] - uv[:, 1]) > c.epipolar
         found[~((disparity >= low) & (disparity <= high)) | off_line] = np.nan

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from frontends.surf.epipolar import HalfImage, half_image
+from frontends.surf.epipolar import HalfImage, float_images
 from slam.errors import SequenceError
 from slam.grey_range import grey_range
 
@@ -34,14 +34,10 @@ class Picture:
         return cls(pixels, _FULL_SCALE[pixels.dtype])
 
     @cached_property
-    def pixels(self) -> NDArray[np.float32]:
-        """The grey values (H, W) in float32."""
-        return self.grey.astype(np.float32)
-
-    @cached_property
-    def half(self) -> HalfImage:
-        """The image at half resolution."""
-        return half_image(self.pixels, 255.0 / self.white)
+    def floats(self) -> tuple[NDArray[np.float32], HalfImage]:
+        """The grey values (H, W) in float32, and the image at half resolution."""
+        pixels, *half = float_images(self.grey, np.float32(255.0 / self.white))
+        return pixels, HalfImage(*half)
 
     @cached_property
     def integral(self) -> NDArray[np.int32]:

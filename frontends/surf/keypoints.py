@@ -91,26 +91,20 @@ def adapted_threshold(threshold: float, count: int, target: int, least: float, m
     return float(np.clip(threshold, least, most))
 
 
-def spread(uv: NDArray[np.float64], limit: int, grid: tuple[int, int], size: tuple[int, int]) -> NDArray[np.intp]:
-    """Rows (K,), ascending, of at most `limit` features, spread over the image.
+@kernel
+def spread(uv, limit, grid, size):
+    """Which features (N,) are kept so that they are spread over the image: `limit` at most, of those the strongest.
 
     `uv` are pixels (N, 2), strongest first; `grid` has columns and rows of cells in an image of width and height `size`
     [px]. Each cell has an equal share of `limit`; what some leave over goes to the strongest of the others.
     """
-    return np.arange(len(uv)) if len(uv) <= limit else np.flatnonzero(_served(uv, limit, grid, size))
-
-
-@kernel
-def _served(uv, limit, grid, size):
-    """Which features (N,) are kept: the share of each cell first, then the strongest of the others."""
     kept, count = np.zeros(len(uv), np.bool_), np.zeros((grid[1], grid[0]), np.int64)
     share = -(-limit // (grid[0] * grid[1]))
     for k in range(len(uv)):
         column = min(max(int(uv[k, 0] * (grid[0] / size[0])), 0), grid[0] - 1)
         row = min(max(int(uv[k, 1] * (grid[1] / size[1])), 0), grid[1] - 1)
-        if limit > 0 and count[row, column] < share:
-            kept[k] = True
-            limit -= 1
+        kept[k] = limit > 0 and count[row, column] < share
+        limit -= kept[k]
         count[row, column] += 1
     for k in range(len(uv)):
         if limit > 0 and not kept[k]:

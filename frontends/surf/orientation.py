@@ -59,16 +59,16 @@ def _sample_gradients(pixels, rows, stride, x, y, s, disc, space):
     side = 2 * half
     for k in range(-RADIUS, RADIUS + 1):
         left, top = int(np.rint(x - 0.5 * (side - 1) + k * s)), int(np.rint(y - 0.5 * (side - 1) + k * s))
-        lefts[k + RADIUS] = left if 0 <= left < stride - side else -1
-        tops[k + RADIUS] = top * stride if 0 <= top < rows - side else -1
+        lefts[k + RADIUS] = left if 0 <= left < stride - side else -pixels.size
+        tops[k + RADIUS] = top * stride if 0 <= top < rows - side else -pixels.size
     h, e = np.uint64(half), np.uint64(side)
     centre, bottom = np.uint64(half * stride), np.uint64(side * stride)
-    n = 0
+    n = np.uint64(0)
     for k in range(disc.weights.size):
-        left, top = lefts[disc.places[k, 0]], tops[disc.places[k, 1]]
-        if left < 0 or top < 0:
+        first = lefts[disc.places[k, 0]] + tops[disc.places[k, 1]]
+        if first < 0:
             continue
-        a = np.uint64(top + left)
+        a = np.uint64(first)
         g = a + bottom
         square = np.int32(np.int32(pixels[g + e] - pixels[g]) - np.int32(pixels[a + e] - pixels[a]))
         left_half = np.int32(np.int32(pixels[g + h] - pixels[g]) - np.int32(pixels[a + h] - pixels[a]))
@@ -77,8 +77,8 @@ def _sample_gradients(pixels, rows, stride, x, y, s, disc, space):
         weight = disc.weights[k]
         gx[n] = np.float32(np.int32(square - 2 * left_half)) * weight
         gy[n] = np.float32(np.int32(2 * upper_half - square)) * weight
-        n += 1
-    return n
+        n += np.uint64(1)
+    return np.int64(n)
 
 
 @helper

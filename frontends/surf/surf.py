@@ -83,7 +83,7 @@ class Surf:
         if mask is not None and np.shape(mask) != picture.grey.shape:
             raise SequenceError(f"mask: shape {np.shape(mask)} is not the image's, {picture.grey.shape}")
         integral, (height, width) = picture.integral, picture.grey.shape
-        limit = c.threshold if threshold is None else threshold
+        limit = np.float32(c.threshold if threshold is None else threshold)
         usable = [o for o in range(c.octaves) if min(width, height) >= layer_sizes(o, c.layers)[2]]
         bank = [make_filters(o, c.layers, 255.0 / picture.white, width + 1) for o in usable]
         count = max(1, min(c.threads, height // _SMALLEST_STRIPE))

@@ -25,8 +25,7 @@ from slam.checks import FARTHEST_POSITION, MOST_ID, definite, require_known
 from slam.data import Estimate, IdArray
 from slam.errors import MeasurementError, SlamError
 from slam.files import Kind, json_text, read_bytes, require_arrays, unpack, whole_file
-from slam.geometry.rig import StereoRig
-from slam.geometry.rig_numbers import rig_difference, rig_numbers
+from slam.geometry.rig import StereoRig, rig_difference, rig_numbers
 from slam.geometry.se3 import Array, nearest_rotation
 from slam.naming import count
 from slam.tracks.table import LandmarkTable

@@ -7,8 +7,6 @@ prior against the data (Box, Sampling and Bayes' inference in scientific modelli
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from slam.calibration.model import RigModel
@@ -24,8 +22,6 @@ GAIN = 49.0
 #: recordings and worlds at hand; of one that is a tenth wrong 12 to 220 where the camera turns, less on straight roads.
 FOCAL_WARNING = 16.0
 
-_DISTORTION = ("left_k1", "right_k1"), ("left_k2", "right_k2")
-
 
 def conflict(model: RigModel, covariance: Array, evidence: Evidence, which: str = "", focal: float = GAIN) -> str:
     """What is wrong with a calibration, in a line; empty where no cause alone explains the images far better.
@@ -34,40 +30,37 @@ def conflict(model: RigModel, covariance: Array, evidence: Evidence, which: str 
     parameters less the prior's mean. A focal length is named from the gain `focal` on, other causes from `GAIN`.
     `which` says which calibration it is: "kept ", or nothing.
     """
-    causes = _causes(model, covariance, evidence, f"{which}calibration")  # the focal length first
-    gains = {words: gain for least, (gain, words) in zip([focal, *[GAIN] * 4], causes) if gain > least}
-    return max(gains, key=lambda words: gains[words], default="")
-
-
-def _causes(model: RigModel, covariance: Array, evidence: Evidence, whose: str) -> Iterator[tuple[float, str]]:
-    """Gains of twice the log-likelihood by causes that are freed of the prior, and the causes in words."""
+    whose, found = f"{which}calibration", dict[str, float]()  # gains by causes in words
     information = np.linalg.inv(covariance)
     posterior = np.linalg.inv(information + evidence.S)
     pull, held = information @ (posterior @ evidence.e), information - information @ posterior @ information
 
     def freed(*directions: tuple[str, ...]) -> tuple[float, list[float]]:
-        """What is gained with these parameters at any values, and the values."""
+        """Twice the log-likelihood that is gained with these parameters at any values, and the values."""
         A = np.column_stack([along(model, *names) for names in directions])
         values = np.linalg.lstsq(A.T @ held @ A, A.T @ pull, rcond=1e-9)[0]  # of what nothing shows: 0
         return float(pull @ A @ values), values.tolist()
 
-    gain, (focal,) = freed(FOCALS)
-    much = f"at least {abs(100 * focal):.0f} % {'shorter' if focal > 0 else 'longer'} than the {whose}'s"
-    yield gain, f"the images fit a focal length {much}: is it of this camera, and for images of this size?"
-    gain, (k1, _) = freed(*_DISTORTION)
+    gain, (share,) = freed(FOCALS)
+    much = f"at least {abs(100 * share):.0f} % {'shorter' if share > 0 else 'longer'} than the {whose}'s"
+    of_focal = f"the images fit a focal length {much}: is it of this camera, and for images of this size?"
+    found[of_focal] = gain
+    gain, (k1, _) = freed(("left_k1", "right_k1"), ("left_k2", "right_k2"))
     cause = "are its coefficients of this camera, in this order and of this model?"
     if not (model.rig.left.has_distortion or model.rig.right.has_distortion):
         cause = "were the coefficients left out?"
-    yield gain, f"the images show a lens distortion that is not in the {whose} (k1 about {-k1:+.2f}): {cause}"
+    found[f"the images show a lens distortion that is not in the {whose} (k1 about {-k1:+.2f}): {cause}"] = gain
     gain, shift = freed(("left_cx", "right_cx"), ("left_cy", "right_cy"))
     much = f"about {model.focal * np.linalg.norm(shift):.0f} px from the {whose}'s"
     cause = "were they cropped, or is it for images of another size?"
-    yield gain, f"the images fit a principal point {much}: {cause}"
+    found[f"the images fit a principal point {much}: {cause}"] = gain
     gain, (offset,) = freed(("right_cx",))
     much = f"about {abs(model.focal * offset):.1f} px off the {whose}'s"
     cause = "was the right image cropped or shifted, or a camera turned since?"
-    yield gain, f"the images fit disparities {much}: {cause}"
+    found[f"the images fit disparities {much}: {cause}"] = gain
     gain, turn = freed(("pitch",), ("roll",))
     much = f"turned by about {np.degrees(np.linalg.norm(turn)):.1f}° against the {whose}'s"
     cause = "was a camera moved since, or is its rotation the inverse one?"
-    yield gain, f"the images fit a right camera that is {much}: {cause}"
+    found[f"the images fit a right camera that is {much}: {cause}"] = gain
+    enough = [words for words, gain in found.items() if gain > (focal if words == of_focal else GAIN)]
+    return max(enough, key=lambda words: found[words], default="")

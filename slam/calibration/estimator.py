@@ -38,15 +38,13 @@ from slam.calibration.posterior import (
 )
 from slam.calibration.saved import SavedCalibration, joint_calibration
 from slam.data import CommonError, Estimate, StereoFeatures
-from slam.errors import ConfigurationError
+from slam.errors import CalibrationError, ConfigurationError
 from slam.geometry.arrays import changed
-from slam.geometry.rig import StereoRig
-from slam.geometry.rig_numbers import rig_numbers
+from slam.geometry.rig import StereoRig, rig_difference, rig_numbers
 from slam.geometry.se3 import Array, adjoint
 from slam.interfaces import Backend, ConsideringBackend, RevisingBackend
 from slam.tracks.follow import Matches
 
-_BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: within a block of so many, errors are taken to be correlated
 _MOST_FEATURES = 1000  # cost: of a view, the strongest ones; half of the usual 800 made drives worse by a half
 
 #: Change of the correction, in standard deviations of the disparities' error, for a back end to revise its past.
@@ -55,6 +53,7 @@ _SIGNIFICANT = 0.5
 #: Standard deviation of the baseline's length, as a share of it: the squares of a calibration board are known to some
 #: tenths of a percent. It scales the whole world, so images never show it.
 BASELINE = 0.002
+_NO_IDS = np.zeros(0, np.int64)
 
 
 class SelfCalibration:
@@ -73,7 +72,8 @@ class SelfCalibration:
             self._prior = self._own_prior = factory_prior(self.model)
             start = self._prior.covariances[-1]
         else:
-            kept.require_fits(rig)
+            if found := rig_difference(kept.rig, rig_numbers(rig)):
+                raise CalibrationError(f"the kept calibration is of another rig: {found}")
             if not config.enabled:
                 raise ConfigurationError("a kept calibration needs self_calibration.enabled=true")
             mean, covariance = kept.posterior.mean, kept.posterior.covariance
@@ -84,8 +84,8 @@ class SelfCalibration:
         # covariance (n, n) of its mean by what its evidence has in common: a systematic error, unknown residual fields
         self._by_bias = np.zeros_like(start)
         self._before = np.linalg.inv(start)  # information (n, n) without evidence
-        self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
-        self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
+        # 8, 4: frames, pairs, within a block of which errors are taken to be correlated
+        self._rows, self._motion = Accumulator(config.inflation, 8), Accumulator(config.inflation, 4)
         self._fields: Evidence | None = None  # of rows: parameters and residual fields
         self._far = self.model.field(self.model.far())[:, 2]  # disparities of far points by the parameters
         self._focal = along(self.model, *FOCALS) / 2  # the focal lengths' common error by the parameters
@@ -194,12 +194,10 @@ class SelfCalibration:
             self._update()
 
     def _has_turned(self, T_world_left: Array) -> bool:
-        """Whether the camera has rotated since the last frame that was used."""
-        if self._looked is None:
-            return True
-        cosine = 0.5 * (np.sum(T_world_left[:3, :3] * self._looked[:3, :3]) - 1)
+        """Whether the camera has rotated since the last frame that was used, by the cosine of the angle."""
         # 0.05: one frame at least per rotation by this angle [rad]: turns are rare, and alone show the focal length
-        return bool(cosine < np.cos(0.05))
+        least = 1 + 2 * np.cos(0.05)
+        return self._looked is None or bool(np.sum(T_world_left[:3, :3] * self._looked[:3, :3]) < least)
 
     def _compare(self, view: View) -> None:
         """Compare a view with the earlier ones, oldest first, until one still overlaps too much and keeps waiting."""
@@ -256,8 +254,7 @@ class SelfCalibration:
     @property
     def _noise(self) -> Array:
         """Covariance (3, 3) of a point ``(x, y, d)`` [px²]."""
-        pixel, disparity = np.exp(self._variances)
-        return np.diag([pixel, pixel, disparity])
+        return np.diag(np.exp(self._variances)[[0, 0, 1]])
 
     def _evidence(self, first: View, second: View, matched: Matches) -> Evidence | None:
         """The evidence of a pair of views with matched features; None without a solution."""
@@ -339,7 +336,7 @@ class RemainingRigError:
             step = applied.parameters - self._measured_with.parameters
             self._revised = self._revised + step
             if isinstance(backend, ConsideringBackend):
-                self._turned = self._turned + _adjoint_of(backend) @ _of_pose(backend)[:, :-2] @ step
+                self._turned = self._turned + _adjoint_of(backend) @ backend.sensitivities(_NO_IDS)[0][:, :-2] @ step
         backend.revise(revision.rows)
         self._measured_with = applied
         return revision
@@ -368,7 +365,7 @@ class RemainingRigError:
         """
         if not (self._calibration.config.enabled and isinstance(backend, ConsideringBackend)):
             return CommonError()
-        J, revised = _of_pose(backend), self._revised
+        J, revised = backend.sensitivities(_NO_IDS)[0], self._revised
         if as_reported:
             J, revised = J.copy(), 0.0 * revised
             J[:, -1] -= J[:, :-2] @ self._revised
@@ -388,11 +385,6 @@ class RemainingRigError:
         root = np.diag(np.append(np.zeros(n), [BASELINE, 1.0]))
         root[:n, :n], root[:n, -1] = self._root[1], self._calibration.applied.parameters - revised
         return root
-
-
-def _of_pose(backend: ConsideringBackend) -> Array:
-    """J (6, n + 2) of the newest pose."""
-    return backend.sensitivities(np.zeros(0, np.int64))[0]
 
 
 def _adjoint_of(backend: Any) -> Array:

@@ -89,71 +89,82 @@ def fit(first, second, R, t, focal, noise, median, steps):
     """Gauss-Newton of `slam.calibration.pairs.fit_motion`, of some steps at most; see there for the arguments.
 
     Without any, the problem is linearised at the first guess. Points are weighted by Student's t distribution of four
-    degrees of freedom, `median` being that of χ². Returns the fields of `slam.calibration.pairs.Fit`, and the last
+    degrees of freedom, `median` being that of χ². Returns what `slam.calibration.pairs.Fit` has, and the last
     change of a predicted point [px], infinite where there is no solution.
     """
     n, last = len(first), np.inf
     R, t, points, weights = R.copy(), t.copy(), first.copy(), np.empty(len(first))
     at = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6)), np.empty((n, 3)), np.empty((n, 3, 3))
-    _, J_point, J_motion, residual, information = at
-    H, step, turn, before = np.empty((6, 6)), np.empty(6), np.empty((3, 4)), np.empty((3, 3))
-    rest, weighted = np.empty(3), np.empty(3)
+    residual, information = at[3:]
+    step, turn, before = np.empty(6), np.empty((3, 4)), np.empty((3, 3))
     for _ in range(max(steps, 1)):
         _linearise(first, second, points, R, t, focal, noise, *at)
         if steps == 0:
             break
-        total = 0.0
         for p in range(n):
             weights[p] = square(information[p], residual[p])
-            total += weights[p]
-        if n == 0 or not np.isfinite(total):
+        if n == 0 or not np.isfinite(weights.sum()):
             last = np.inf
             break
         # 0.2: no less than a fifth of the configured noise
         scale = max(np.median(weights) / median, 0.2 * 0.2)
-        step[:] = 0.0
-        H[:] = 0.0
-        for p in range(n):
-            weights[p] = 7.0 / (4.0 + weights[p] / scale) / scale
-            for i in range(6):
-                for k in range(3):
-                    weighted[k] = weights[p] * column_times(information[p], k, J_motion[p, :, i])
-                step[i] += weighted[0] * residual[p, 0] + weighted[1] * residual[p, 1] + weighted[2] * residual[p, 2]
-                for j in range(i + 1):
-                    H[i, j] += column_times(J_motion[p], j, weighted)
-        ridge = 1e-12 * (H[0, 0] + H[1, 1] + H[2, 2] + H[3, 3] + H[4, 4] + H[5, 5])
-        for i in range(6):
-            H[i, i] += ridge
-        factorise(H, 6)
-        solve_factorised(H, 6, step)
+        weights[:] = 7.0 / (4.0 + weights / scale) / scale
+        _solve(*at[2:], weights, step)
         exp(step, turn)
         assign(R, before)
         for i in range(3):
             t[i] += step[3 + i]
             for j in range(3):
                 R[i, j] = column_times(before, j, turn[i])
-        last = 0.0
-        for p in range(n):
-            for i in range(3):
-                change = 0.0
-                for k in range(6):
-                    change += J_motion[p, i, k] * step[k]
-                rest[i] = residual[p, i] - change
-                last = last if abs(change) <= last else abs(change)  # NaN counts
-            for i in range(3):
-                weighted[i] = row_times(information[p], i, rest)
-            for i in range(3):
-                rest[i] = column_times(J_point[p], i, weighted)
-            for i in range(3):
-                points[p, i] = first[p, i] + column_times(noise, i, rest)
+        last = _correct(first, *at[1:], step, noise, points)
         if not last >= 1e-3:  # 1e-3: [px]; at 0.02 focal lengths were wrong by percents
             break
-    return R, t, points, at, weights, last
+    return (R, t, points, *at, weights), last
+
+
+@helper
+def _solve(J_motion, residual, information, weights, step):
+    """The step (6,) of the motion that solves the weighted normal equations."""
+    H, weighted, ridge = np.zeros((6, 6)), np.empty(3), 0.0
+    step[:] = 0.0
+    for p in range(len(weights)):
+        for i in range(6):
+            for k in range(3):
+                weighted[k] = weights[p] * column_times(information[p], k, J_motion[p, :, i])
+            step[i] += weighted[0] * residual[p, 0] + weighted[1] * residual[p, 1] + weighted[2] * residual[p, 2]
+            for j in range(i + 1):
+                H[i, j] += column_times(J_motion[p], j, weighted)
+    for i in range(6):
+        ridge += H[i, i]
+    for i in range(6):
+        H[i, i] += 1e-12 * ridge
+    factorise(H, 6)
+    solve_factorised(H, 6, step)
+
+
+@helper
+def _correct(first, J_point, J_motion, residual, information, step, noise, points):
+    """Estimate the first view's points anew after a step; the largest change of a predicted one [px], NaN counts."""
+    last, rest, weighted = 0.0, np.empty(3), np.empty(3)
+    for p in range(len(points)):
+        for i in range(3):
+            change = 0.0
+            for k in range(6):
+                change += J_motion[p, i, k] * step[k]
+            rest[i] = residual[p, i] - change
+            last = last if abs(change) <= last else abs(change)
+        for i in range(3):
+            weighted[i] = row_times(information[p], i, rest)
+        for i in range(3):
+            rest[i] = column_times(J_point[p], i, weighted)
+        for i in range(3):
+            points[p, i] = first[p, i] + column_times(noise, i, rest)
+    return last
 
 
 @helper
 def _linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motion, residual, information):
-    """Fill in the fields of `slam.calibration.pairs.Linear`, at a motion and estimates of the first view's points."""
+    """Fill in what `slam.calibration.pairs.Fit` has, at a motion and estimates of the first view's points."""
     by_all, by_depth, B, C = np.empty((3, 9)), np.empty(9), np.empty((3, 3)), np.empty((3, 3))
     for p in range(len(points)):
         x, y, d = points[p, 0], points[p, 1], points[p, 2]

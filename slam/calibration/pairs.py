@@ -93,7 +93,7 @@ def pair_of(
         if fitted is None:
             break
         R, t = fitted.R, fitted.t
-        distance = _fitted(one, two, R, t, model.focal, noise, 0)[0].linear.squared
+        distance = _fitted(one, two, R, t, model.focal, noise, 0)[0].squared
         # 16.3: χ²(3) at 99.9 %, largest squared distance of a match that agrees
         agree = distance <= 16.3 * median(distance[agree]) / _MEDIAN_3
     return Pair(one[agree], two[agree], R, t)
@@ -106,34 +106,28 @@ def _agreeing(model: RigModel, first: Array, second: Array, R: Array, t: Array) 
         return (np.abs(moved - second) <= _EACH * np.sqrt(1 + np.square(J).sum(axis=2))).all(axis=1)
 
 
-class Linear(NamedTuple):
-    """A motion linearised at estimates of the first view's points.
+class Fit(NamedTuple):
+    """The motion that takes one view's points to the other's, linearised at estimates of the first view's points.
 
     The residuals carry the points' own corrections to first order. The motion amplifies the disparity errors of near
     points, so that a limit in pixels would keep only points whose errors happen to be small.
     """
 
-    moved: Array  # where the motion takes the points (N, 3) [px]
+    R: Array  # the motion
+    t: Array
+    points: Array  # the first view's, estimated from both views (N, 3) [px]
+    moved: Array  # where the motion takes the points, in the last step (N, 3) [px]
     J_point: Array  # derivatives of `moved` by the points (N, 3, 3)
     J_motion: Array  # and by ``[rotation (left), t]`` (N, 3, 6)
     residual: Array  # second view less its prediction from the first (N, 3) [px]
     information: Array  # of the residuals (N, 3, 3), up to a common factor
+    weights: Array  # of the points (N,)
 
     @property
     def squared(self) -> Array:
         """Squared Mahalanobis distances of the residuals (N,)."""
         weighted = self.information @ self.residual[:, :, None]
         return np.asarray((self.residual * weighted[:, :, 0]).sum(axis=1))
-
-
-class Fit(NamedTuple):
-    """The motion that takes one view's points to the other's, and the linear problem about it."""
-
-    R: Array  # the motion
-    t: Array
-    points: Array  # the first view's, estimated from both views (N, 3) [px]
-    linear: Linear  # the problem of the last step
-    weights: Array  # of the points (N,)
 
 
 def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array) -> Fit | None:
@@ -158,13 +152,12 @@ def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) 
     fit = fit_motion(*pair, model.focal, noise)
     if fit is None:
         return None
-    at = fit.linear
-    by_rig = at.J_point @ model.field(fit.points)[:, :3] - model.field(at.moved)[:, :3]
-    J = np.concatenate([at.J_motion, by_rig], axis=2)
-    by_moved = fit.weights[:, None, None] * at.information @ J
+    by_rig = fit.J_point @ model.field(fit.points)[:, :3] - model.field(fit.moved)[:, :3]
+    J = np.concatenate([fit.J_motion, by_rig], axis=2)
+    by_moved = fit.weights[:, None, None] * fit.information @ J
     rows = by_moved.reshape(-1, J.shape[2])
-    normal, gradient = rows.T @ J.reshape(rows.shape), rows.T @ at.residual.ravel()
-    by_fields = at.J_point @ model.residual_field(fit.points)[:, :3] - model.residual_field(at.moved)[:, :3]
+    normal, gradient = rows.T @ J.reshape(rows.shape), rows.T @ fit.residual.ravel()
+    by_fields = fit.J_point @ model.residual_field(fit.points)[:, :3] - model.residual_field(fit.moved)[:, :3]
     cross = rows.T @ by_fields.reshape(len(rows), -1)
     H = normal[:6, :6] + 1e-12 * np.trace(normal[:6, :6]) * np.eye(6)  # invertible
     motion = np.linalg.solve(H, normal[:6, 6:])  # Schur complement
@@ -200,7 +193,8 @@ def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array,
     shares, with D the true disparity. It has no singularity at infinity, where D = 0. Returns moved points (N, 3),
     Jacobians by the points (N, 3, 3), and by ``[rotation (left), t]`` (N, 3, 6).
     """
-    return _fitted(points, points, R, t, focal, np.eye(3), 0)[0].linear[:3]
+    at = _fitted(points, points, R, t, focal, np.eye(3), 0)[0]
+    return at.moved, at.J_point, at.J_motion
 
 
 def _fitted(
@@ -208,5 +202,5 @@ def _fitted(
 ) -> tuple[Fit, float]:
     """The motion after `steps` at most, and the last change of a predicted point [px], infinite without a solution."""
     arrays = (np.ascontiguousarray(a, float) for a in (first, second, R, t))
-    R, t, points, at, weights, last = kernels.fit(*arrays, focal, noise, _MEDIAN_3, steps)
-    return Fit(R, t, points, Linear(*at), weights), float(last)
+    found, last = kernels.fit(*arrays, focal, noise, _MEDIAN_3, steps)
+    return Fit(*found), float(last)

@@ -23,7 +23,6 @@ from slam.geometry.se3 import Array
 RESIDUAL_SCALES = np.geomspace(0.05, 5.0, 10)
 
 _MEDIAN = chi_square_limit(1, 0.5)  # derived: of χ² with one degree of freedom
-_PRIOR_TERMS = 20.0  # degrees of freedom that the configured inflation counts for
 
 #: Standard deviations of the corrections, dimensionless [rad, focal lengths, 1]. A chess board fixes combinations of
 #: parameters far better than each one: a shift of the principal point looks like a turn of the camera, and moves the
@@ -36,19 +35,9 @@ SIGMAS = {
     "pitch": 0.014, "yaw": 0.02, "roll": 0.004, "down": 0.007, "forward": 0.02,
 }  # fmt: skip
 
-#: Errors that a chess board does bound: the mean over the image of the disparity of far points, and of the vertical
-#: disparity [focal lengths].
-MEAN_DISPARITY = 7e-4
-MEAN_VERTICAL = 1.4e-3  # the same of the vertical disparity [focal lengths]
-
 #: Offset of all disparities [focal lengths]: even after the best calibration, shocks and warming turn the cameras by
 #: less than a milliradian.
 OFFSET = 7e-4
-
-#: Root mean square over the image of the errors of far points' disparities and rows [focal lengths]: about a pixel at a
-#: focal length of 700 px, as reprojection errors would show larger ones. Such fields are smooth, so they have some ten
-#: independent values.
-FIELD = 1.4e-3
 
 #: Error of the focal length common to both cameras, as the board's distance or curvature may compensate it [share].
 FOCAL = 0.005
@@ -195,7 +184,8 @@ class Accumulator:
         if terms > 0:
             ratio = scatter / (terms * (1 - 1 / count))
             weight = terms / self.inflation * (count - 1)  # parameters that the data determine, for each block
-            self.inflation = max(1.0, (_PRIOR_TERMS * self._prior + weight * ratio) / (_PRIOR_TERMS + weight))
+            # 20: degrees of freedom that the configured inflation counts for
+            self.inflation = max(1.0, (20.0 * self._prior + weight * ratio) / (20.0 + weight))
 
 
 def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Array) -> tuple[Evidence, Evidence]:
@@ -230,11 +220,6 @@ class Prior:
         """Inverses of the covariances (K, n, n)."""
         return np.linalg.inv(self.covariances)
 
-    @cached_property
-    def log_determinants(self) -> Array:
-        """Of the information (K,)."""
-        return np.asarray(np.linalg.slogdet(self.information)[1])
-
 
 def factory_prior(model: RigModel) -> Prior:
     """Prior of a calibration as delivered, by how calibrations are usually made."""
@@ -264,10 +249,13 @@ def prior_information(model: RigModel) -> Array:
     information = np.diag(sigmas**-2)
     far = model.far()
     field = model.field(far) / model.focal
-    for change, sigma in ((field[:, 2], MEAN_DISPARITY), (field[:, 3], MEAN_VERTICAL)):
+    # 7e-4, 1.4e-3: a chess board bounds the means over the image of far points' disparities and rows [focal lengths]
+    for change, sigma in ((field[:, 2], 7e-4), (field[:, 3], 1.4e-3)):
         mean = change.mean(axis=0)
         information += np.outer(mean, mean) / sigma**2
-        information += change.T @ change * (10 / (len(far) * FIELD**2))  # 10: independent values of such a field
+        # 1.4e-3: and their root mean square: about a pixel at a focal length of 700 px, as reprojection errors would
+        # show larger ones. 10: such fields are smooth, so they have some ten independent values
+        information += change.T @ change * (10 / (len(far) * 1.4e-3**2))
     return np.asarray(information)
 
 
@@ -289,8 +277,7 @@ def systematic_variance(model: RigModel, error: float) -> Array:
     surfaces and moving shadows are matched with such a bias; it does not average out.
     """
     far = model.far()
-    near = far + np.array([0.0, 0.0, 0.05 * model.focal])
-    points = np.concatenate([far, near])
+    points = np.concatenate([far, far + np.array([0.0, 0.0, 0.05 * model.focal])])
     effect = np.square(model.field(points)[:, 2:]).sum(axis=1)
     return np.asarray(error**2 / effect.mean(axis=0))
 
@@ -331,7 +318,8 @@ def solve(prior: Prior, evidence: Evidence, known: Evidence | None = None) -> Ri
     """
     e, information = evidence.e - evidence.S @ prior.mean, prior.information + evidence.S
     fits = np.linalg.solve(information, np.broadcast_to(e[:, None], (len(information), len(e), 1)))[..., 0] @ e
-    logs = 0.5 * (prior.log_determinants - np.linalg.slogdet(information)[1] + fits)
+    before, after = (np.linalg.slogdet(matrices)[1] for matrices in (prior.information, information))
+    logs = 0.5 * (before - after + fits)
     weights = np.exp(logs - logs.max())
     known = evidence if known is None else known
     likely = weights > 1e-12  # numerics: of a scale, beside the likeliest

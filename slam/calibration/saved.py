@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
@@ -17,8 +18,7 @@ from slam.calibration.model import RigModel
 from slam.calibration.posterior import Prior, RigEvidence, RigPosterior, factory_prior, solve
 from slam.errors import CalibrationError
 from slam.files import expanded, read_text, write_text
-from slam.geometry.rig import StereoRig
-from slam.geometry.rig_numbers import NUMBERS, rig_difference, rig_numbers
+from slam.geometry.rig import NUMBERS, rig_numbers
 from slam.geometry.se3 import Array
 
 _LIMIT = 2**24  # bytes of a file: the summary of a run with all its settings is far smaller
@@ -47,15 +47,6 @@ class SavedCalibration:
         rig = f"{r['width']:.0f}x{r['height']:.0f}, focal length {r['focal']:.1f} px, baseline {r['baseline']:.4f} m"
         return f"SavedCalibration({rig}; {self.posterior!r})"
 
-    def require_fits(self, rig: StereoRig) -> None:
-        """Raise if it is for another rig.
-
-        Raises:
-            CalibrationError: a number of the rig as calibrated differs.
-        """
-        if found := rig_difference(self.rig, rig_numbers(rig)):
-            raise CalibrationError(f"the kept calibration is of another rig: {found}")
-
     def to_json(self) -> dict[str, Any]:
         """As plain types."""
         evidence = None if self.evidence is None else self.evidence.to_text()
@@ -75,12 +66,9 @@ class SavedCalibration:
             covariance = np.array(tree["covariance"], float).reshape(len(rows), len(rows))
             text = tree.get("evidence")
             evidence = None if text is None else RigEvidence.from_text(text, len(rows))
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise CalibrationError(f"calibration: cannot be read: {' '.join(str(error).split())}") from error
-        try:
             rig = {name: float(tree["rig"][name]) for name in NUMBERS}
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise CalibrationError("calibration: it does not say of which rig it is") from error
+            raise CalibrationError(f"calibration: cannot be read: {' '.join(str(error).split())}") from error
         if not all(np.isfinite(numbers).all() for numbers in (mean, covariance, list(rig.values()))):
             raise CalibrationError("calibration: all its numbers must be finite")
         if names != RigModel.names:
@@ -170,11 +158,9 @@ def load_calibration(path: str | Path) -> SavedCalibration:
     file = expanded(path, CalibrationError)
     file = file / "summary.json" if os.path.isdir(file) else file  # noqa: PTH112 unlike Path's, without errors
     text = read_text(file, _LIMIT, CalibrationError)
-    try:
+    tree = None
+    with suppress(ValueError, RecursionError, AttributeError):  # AttributeError: of what is no mapping
         tree = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"{file}: {_NOT_KEPT}") from error
-    if isinstance(tree, Mapping):
         tree = tree.get("self_calibration", tree)
     if not isinstance(tree, Mapping) or "parameters" not in tree:
         raise CalibrationError(f"{file}: {_NOT_KEPT}")

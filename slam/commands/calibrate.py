@@ -15,6 +15,7 @@ from slam.commands.run import frame_count
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
 from slam.files import noting_inputs
+from slam.naming import count as count_of
 from slam.run.calibrating import calibrate as run
 from slam.sequences import open_sequence
 from slam.settings import require_settable
@@ -45,6 +46,8 @@ def calibrate(
     with noting_inputs() as inputs:
         opened = [open_sequence(text, format=format) for text in texts]
     count = sum(frame_count(sequence, *frames) or 0 for sequence in opened)
+    if not quiet:
+        print(f"{count_of(len(opened), 'recording')}, {count} frames: each is run once, then what they say is added up")
     with progress(count, "calibrate", quiet) as tell:
         found = run(opened, out, settings, frames, inputs, overwrite, tell)
     for warning in found["warnings"]:

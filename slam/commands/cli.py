@@ -5,9 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import sys
-import threading
-from contextlib import ExitStack
-from dataclasses import replace
 from io import TextIOWrapper
 from pathlib import Path
 from shutil import get_terminal_size
@@ -15,7 +12,7 @@ from typing import Annotated, Any, TypeAlias
 
 import typer
 
-from slam.commands.ending import catch_signals, one_line_errors, whole_frames
+from slam.commands.ending import catch_signals, one_line_errors
 from slam.errors import ConfigurationError
 from slam.registry import ONLINE
 
@@ -33,9 +30,9 @@ def option(help: str, metavar: str | None = None, *names: str, **more: Any) -> A
     return typer.Option(*names, metavar=metavar, help=help, **more)
 
 
-def argument(help: str, metavar: str, show_default: bool = False) -> Any:
+def argument(help: str, metavar: str) -> Any:
     """An argument of a command."""
-    return typer.Argument(metavar=metavar, help=help, show_default=show_default)
+    return typer.Argument(metavar=metavar, help=help, show_default=False)
 
 
 _File: TypeAlias = Path | None
@@ -43,22 +40,16 @@ _Text: TypeAlias = str | None
 
 #: Options that several commands share.
 _Out = Annotated[Path, option("Folder for the files.", "DIR", "--out", "-o")]
-_RunOut = Annotated[
-    Path | None, option("Folder for the files; default: results/SEQUENCE-BACKEND-N.", "DIR", "--out", "-o")
-]
+_RunOut = Annotated[_File, option("Folder; default: results/SEQUENCE-BACKEND-N.", "DIR", "--out", "-o")]
 _Overwrite = Annotated[bool, option("Replace files that are there; never an input.", None, "--overwrite")]
-_Set = Annotated[
-    list[str] | None,
-    option("A setting, e.g. map.max_landmarks=300; once per setting; see `slam settings`.", "KEY=VALUE", "--set"),
-]
+_Texts: TypeAlias = list[str] | None
+_Set = Annotated[_Texts, option("A setting, e.g. map.max_landmarks=300; see `slam settings`.", "KEY=VALUE", "--set")]
 _Backend = Annotated[str | None, option("Back end, see `slam list`; default: ekf.", "NAME")]
 _Frames = Annotated[str | None, option("Range of frames, B left out.", "A:B")]
 _Quiet = Annotated[bool, option("No progress, no table.", None, "--quiet", "-q")]
 _Picture = Annotated[bool, option("Leave a picture of the run.", None, "--picture/--no-picture")]
 _Format = Annotated[str | None, option("Format, or module:function; default: found out from the folder.", "FORMAT")]
-_Mask = Annotated[
-    str | None, option("Image that is black where a camera sees its own car; left, right.", "FILE[,FILE]")
-]
+_Mask = Annotated[_Text, option("Image that is black where a camera sees its own car; left, right.", "FILE[,FILE]")]
 
 
 def main() -> None:
@@ -100,7 +91,7 @@ def common_options(version: _Version = False) -> None:
 @app.command("demo", short_help="Try three back ends on a built-in scene.")
 def demo_command(
     out: _Out = Path("slam_demo"),
-    frames: Annotated[int, option("Number of frames.", "N", min=10)] = 150,
+    frames: Annotated[int, option("Number of frames.", "N")] = 150,
     overwrite: _Overwrite = False,
     quiet: _Quiet = False,
 ) -> None:
@@ -134,45 +125,17 @@ def run_command(
     quiet: _Quiet = False,
 ) -> None:
     """Run one sequence through one back end."""
-    from slam.commands.display import progress
-    from slam.commands.run import finish, frame_count, prepare, run_folder, title
-    from slam.files import noting_inputs
-    from slam.outputs import require_outputs
-    from slam.run import drawing
-    from slam.run import viewer as viewing
-    from slam.run.runner import run
-    from slam.run.summary import RunRecord
-    from slam.run.warm_up import compile_kernels
-    from slam.sequences import is_live, with_mask
+    from slam.commands.run import run_sequence
+    from slam.sequences import with_mask
 
-    with noting_inputs() as inputs:
-        opened, options = prepare(
-            with_mask(sequence, mask), settings or (), frames, backend=backend, frontend=frontend, kind=kind,
-            format=format, prior_map=prior_map, mono=mono, calibration=calibration, record=record, save_map=save_map,
-            live=live,
-        )  # fmt: skip
-    shown_as = frame_count(opened, options.start, options.stop), title(opened, options.backend), quiet
-    with ExitStack() as stack:
-        folder = stack.enter_context(run_folder(out, opened.name, options.backend))
-        options = replace(options, out=folder)
-        written = [*options.outputs, *([drawing.output(draw)] if draw else []), *viewing.outputs(viewer, "--viewer")]
-        require_outputs(written, inputs, overwrite)
-        gathered = RunRecord()  # its time of compiling begins here
-        tell = stack.enter_context(progress(*shown_as))
-        if options.config.objects.mode != "off":
-            compile_kernels(options.backend, options.frontend)
-        watches = []
-        if viewer is not None:
-            watches.append(stack.enter_context(viewing.Viewer(viewer, opened.rig, opened.ground_truth)).show)
-        if draw is not None:
-            watches.append(stack.enter_context(drawing.FramePictures(draw)).show)
-        until = threading.Event() if live or is_live(opened) else None
-        if until is not None and not quiet:
-            what = "are taken until" if is_live(opened) else "come at their own rate, to the last one or until"
-            print(f"slam: loading; then frames {what} Ctrl-C ends the run", file=sys.stderr)
-        end_of_frame = stack.enter_context(whole_frames(tell, folder, until))
-        summary = run(opened, options, end_of_frame, watches=watches, until=until, record=gathered)
-    finish(summary, written, picture, quiet)
+    choices = {
+        "backend": backend, "frontend": frontend, "kind": kind, "record": record, "prior_map": prior_map,
+        "save_map": save_map, "mono": mono, "calibration": calibration, "live": live,
+    }  # fmt: skip
+    run_sequence(
+        with_mask(sequence, mask), out, settings or [], frames, format, choices, viewer=viewer, draw=draw,
+        picture=picture, overwrite=overwrite, quiet=quiet,
+    )  # fmt: skip
 
 
 @app.command("replay", short_help="Feed a back end recorded measurements.")
@@ -186,26 +149,9 @@ def replay_command(
     quiet: _Quiet = False,
 ) -> None:
     """Give a back end the same measurements that another one was given."""
-    from slam.commands.display import progress
-    from slam.commands.run import command_line, finish, run_folder, title
-    from slam.config import SystemConfig
-    from slam.outputs import require_outputs
-    from slam.run.options import RunOptions
-    from slam.run.recording import load_recording
-    from slam.run.runner import run_recording
-    from slam.settings import require_settable
+    from slam.commands.run import run_recorded
 
-    loaded, name = load_recording(recording), backend or "ekf"
-    default = SystemConfig.for_kind(loaded.kind, None)
-    require_settable(settings or [], default.to_json(), "")
-    config = replace(default, models=loaded.models).with_settings(settings or [])
-    with run_folder(out, loaded.name, name) as folder:
-        options = RunOptions(name, "recording", config, folder, kind=loaded.kind, command=command_line())
-        require_outputs(options.outputs, [recording], overwrite)
-        shown_as = len(loaded), title(loaded, name), quiet
-        with progress(*shown_as) as tell, whole_frames(tell, folder) as end_of_frame:
-            summary = run_recording(loaded, options, end_of_frame)
-    finish(summary, options.outputs, picture, quiet)
+    run_recorded(recording, out, backend, settings or [], picture, overwrite, quiet)
 
 
 @app.command("plot", short_help="Draw finished runs.")
@@ -239,7 +185,7 @@ def compare_command(
     frontend: Annotated[str, option("Front end; simulated: a world's own features, no images.", "NAME")] = "surf",
     settings: _Set = None,
     mask: _Mask = None,
-    trials: Annotated[int, option("Seeds 0 to N - 1 of every synthetic world.", "N", min=1)] = 12,
+    trials: Annotated[int, option("Seeds 0 to N - 1 of every synthetic world.", "N")] = 12,
     frames: _Frames = None,
     replay: Annotated[bool, option("Also feed the first back end's measurements to all.", None, "--replay")] = False,
     workers: Annotated[int | None, option("Processes; default: the number of cores.", "N")] = None,

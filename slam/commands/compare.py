@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from slam import registry
+from slam.commands.run import require_no_recording
 from slam.compare.plan import CLOSED_LOOP, Plan, Trial, is_world
 from slam.compare.report import write_report
 from slam.compare.sweep import Run, check, is_done, run_jobs, sweep
@@ -25,12 +26,7 @@ _TRIED = 15  # frames by which the time of a comparison is told
 
 
 def compare(
-    plan: Plan,
-    out: Path,
-    workers: int | None = None,
-    quiet: bool = False,
-    overwrite: bool = False,
-    command: str = "",
+    plan: Plan, out: Path, workers: int | None = None, quiet: bool = False, overwrite: bool = False, command: str = ""
 ) -> list[Run]:
     """Run a comparison to its end and leave ``report.html``, tables and figures in `out`.
 
@@ -56,6 +52,7 @@ def compare(
     count = available_cores() if workers is None else workers
     if count < 1:
         raise ConfigurationError(f"comparison: workers must be 1 or more, got {count}")
+    require_no_recording(out)
     frames = check(plan, out, overwrite)  # before there is a progress bar
     total, done = sum(frames[trial.sequence] for trial in plan.every), 0
     limits = caution(plan, plan.trials if any(map(is_world, plan.sequences)) else 1)
@@ -64,8 +61,7 @@ def compare(
         before = f", {len(plan.every) - len(left)} of them done before" if len(left) < len(plan.every) else ""
         seconds = _seconds(left, frames) if left else None
         about = "" if seconds is None else f": about {seconds / min(count, len(left)):.0f} s, by the first frames"
-        print(f"{len(plan.every)} runs{before}, {total} frames in all, {count} at a time{about}")
-        print(limits, flush=True)
+        print(f"{len(plan.every)} runs{before}, {total} frames in all, {count} at a time{about}\n{limits}", flush=True)
     with counting(total, "frames", quiet) as tell:
 
         def ended(trial: Trial) -> None:
@@ -79,15 +75,19 @@ def compare(
     report = write_report(plan, every, runs, out, limits, command)
     if not quiet:
         print_conclusions(every)
-        failed = [run for run in runs if not run.completed]
-        told: dict[str, list[Run]] = {}
-        for run in runs:
-            for text in run.said if run.completed else [run.outcome]:
-                told.setdefault(f"{run.trial.sequence}: {text}", []).append(run)
-        for text, own in list(told.items())[:_NAMED]:
-            print(f"{text} ({', '.join(dict.fromkeys(run.trial.backend for run in own))}, {count_of(len(own), 'run')})")
-        print(f"Runs: {len(runs)}, {len(failed)} failed. Report: {report}")
+        _print_doubts(runs)
+        print(f"Runs: {len(runs)}, {sum(not run.completed for run in runs)} failed. Report: {report}")
     return runs
+
+
+def _print_doubts(runs: Sequence[Run]) -> None:
+    """Lines on runs that failed or are doubted, and on their warnings, each once with the runs that it holds for."""
+    told: dict[str, list[Run]] = {}
+    for run in runs:
+        for text in run.said if run.completed else [run.outcome]:
+            told.setdefault(f"{run.trial.sequence}: {text}", []).append(run)
+    for text, own in list(told.items())[:_NAMED]:
+        print(f"{text} ({', '.join(dict.fromkeys(run.trial.backend for run in own))}, {count_of(len(own), 'run')})")
 
 
 def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:

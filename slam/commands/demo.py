@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from slam.commands.display import print_summary, progress
+from slam.commands.run import require_no_recording
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.files import write_png
@@ -24,7 +25,7 @@ from slam.sequences import open_sequence
 
 #: As real cameras differ from their calibration; with exact ones errors would be a third of what covariances claim.
 _WORLD = "synthetic:aisle?frames={}&speed=2&box=1&focal_error=0.002&turn_error=0.7"
-_WHY = "Errors over claimed σ: at 2 they are twice as large as claimed."
+_WHY = "Errors / claimed σ: at 2 they are twice as large as claimed."
 
 _FRAME = "frame.png"
 _SECONDS = 0.07  # of a frame, about
@@ -37,6 +38,7 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     frame in which the box was measured). Raises SlamError where a file cannot be written, or is
     there already and may not be replaced.
     """
+    require_no_recording(out)
     own = Output(out, "--out", [PICTURE, _FRAME])
     require_outputs([own, *(Output(out / backend, "--out", NAMES) for backend in ONLINE)], (), overwrite)
     summaries: list[dict[str, Any]] = []

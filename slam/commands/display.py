@@ -81,9 +81,7 @@ def print_conclusions(every: Sequence[Group]) -> None:
         for text in tables.sentences(group):
             _say(text)
         table = empty_table("", tables.heads(group))
-        for metric in group.metrics:
-            if not metric.main:
-                continue
+        for metric in group.first_metrics:
             first, *others = tables.row(group, metric)
             words = ((cell["mean"], _COLOURS.get(cell["verdict"], "default"), cell["verdict"]) for cell in others)
             cells = [f"{mean} [{colour}]{verdict}[/]" for mean, colour, verdict in words]

@@ -1,12 +1,13 @@
-"""``slam run``: what the command line asks for, the folder of a run, and how it ends."""
+"""``slam run`` and ``replay``: what the command line asks for, the folder of a run, and how it ends."""
 
 from __future__ import annotations
 
 import re
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -15,16 +16,22 @@ from typing import Any
 import typer
 
 from slam.calibration import load_calibration
-from slam.commands.display import print_summary
+from slam.commands.display import print_summary, progress
+from slam.commands.ending import whole_frames
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError
-from slam.files import note_input
-from slam.outputs import Output
+from slam.files import note_input, noting_inputs
+from slam.outputs import Output, require_outputs
+from slam.run import drawing
+from slam.run import viewer as viewing
 from slam.run.options import RunOptions, parse_frames
 from slam.run.plots import leave_picture
-from slam.run.recording import Recording
+from slam.run.recording import Recording, load_recording
+from slam.run.runner import run, run_recording
+from slam.run.summary import RunRecord
+from slam.run.warm_up import compile_kernels
 from slam.sequences import Sequence as StereoSequence
-from slam.sequences import is_live, open_sequence
+from slam.sequences import format_of, is_live, open_sequence
 from slam.settings import require_settable
 
 _BACKEND, _FRONTEND = "ekf", "surf"
@@ -32,14 +39,61 @@ RESULTS = Path("results")
 _LONGEST = 60  # characters of a sequence's name in a folder's
 
 
-def prepare(
-    source: str, settings: Sequence[str] = (), frames: str | None = None, format: str | None = None, **choices: Any
-) -> tuple[StereoSequence, RunOptions]:
-    """The sequence, opened, and what to do with it; the folder is still to be chosen.
+def run_sequence(
+    source: str, out: Path | None, settings: Sequence[str], frames: str | None, format: str | None,
+    choices: Mapping[str, Any], *, viewer: str | None, draw: Path | None, picture: bool, overwrite: bool, quiet: bool,
+) -> None:  # fmt: skip
+    """Run a sequence as the command line asks; `choices` are fields of `RunOptions`, None or False where it is silent.
 
-    `choices` are fields of `RunOptions`, None or False where the command line says nothing. Raises SlamError on bad
-    input.
+    Raises SlamError on bad input, and `typer.Exit` as `finish` does.
     """
+    with noting_inputs() as inputs:
+        opened, options = _prepared(source, settings, frames, format, choices)
+    with ExitStack() as stack:
+        folder = stack.enter_context(run_folder(out, opened.name, options.backend))
+        options = replace(options, out=folder)
+        written = [*options.outputs, *([drawing.output(draw)] if draw else []), *viewing.outputs(viewer, "--viewer")]
+        require_outputs(written, inputs, overwrite)
+        gathered = RunRecord()  # its time of compiling begins here
+        total = frame_count(opened, options.start, options.stop)
+        tell = stack.enter_context(progress(total, _title(opened, options.backend), quiet))
+        if options.config.objects.mode != "off":
+            compile_kernels(options.backend, options.frontend)
+        watches = []
+        if viewer is not None:
+            watches.append(stack.enter_context(viewing.Viewer(viewer, opened.rig, opened.ground_truth)).show)
+        if draw is not None:
+            watches.append(stack.enter_context(drawing.FramePictures(draw)).show)
+        until = threading.Event() if options.live or is_live(opened) else None
+        if until is not None and not quiet:
+            what = "are taken until" if is_live(opened) else "come at their own rate, to the last one or until"
+            print(f"slam: loading; then frames {what} Ctrl-C ends the run", file=sys.stderr)
+        end_of_frame = stack.enter_context(whole_frames(tell, folder, until))
+        summary = run(opened, options, end_of_frame, watches=watches, until=until, record=gathered)
+    finish(summary, written, picture, quiet)
+
+
+def run_recorded(
+    recording: Path, out: Path | None, backend: str | None, settings: Sequence[str], picture: bool, overwrite: bool,
+    quiet: bool,
+) -> None:  # fmt: skip
+    """Give a back end what a run has recorded; raises as `run_sequence` does."""
+    loaded, name = load_recording(recording), backend or _BACKEND
+    default = SystemConfig.for_kind(loaded.kind, None)
+    require_settable(settings, default.to_json(), "")
+    config = replace(default, models=loaded.models).with_settings(settings)
+    with run_folder(out, loaded.name, name) as folder:
+        options = RunOptions(name, "recording", config, folder, kind=loaded.kind, command=command_line())
+        require_outputs(options.outputs, [recording], overwrite)
+        with progress(len(loaded), _title(loaded, name), quiet) as tell, whole_frames(tell, folder) as end_of_frame:
+            summary = run_recording(loaded, options, end_of_frame)
+    finish(summary, options.outputs, picture, quiet)
+
+
+def _prepared(
+    source: str, settings: Sequence[str], frames: str | None, format: str | None, choices: Mapping[str, Any]
+) -> tuple[StereoSequence, RunOptions]:
+    """The sequence, opened, and what to do with it; the folder is still to be chosen."""
     said = {name: value for name, value in choices.items() if value}
     options = replace(RunOptions(_BACKEND, _FRONTEND, SystemConfig()), **said)
     opened = open_sequence(source, format=format)
@@ -57,7 +111,7 @@ def prepare(
     return opened, replace(options, config=config, start=start, stop=stop, kind=kind, command=command_line())
 
 
-def title(sequence: StereoSequence | Recording, backend: str) -> str:
+def _title(sequence: StereoSequence | Recording, backend: str) -> str:
     """A short name for a progress bar: of a world its name alone."""
     name = sequence.name.partition("?")[0]
     return f"{name if len(name) <= 12 else f'…{name[-11:]}'} · {backend}"
@@ -110,6 +164,7 @@ def run_folder(out: Path | None, sequence: str, backend: str) -> Iterator[Path]:
     SlamError where none can be made.
     """
     if out is not None:
+        require_no_recording(out)
         yield out
         return
     for number in count(1):
@@ -127,6 +182,12 @@ def run_folder(out: Path | None, sequence: str, backend: str) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # it is not empty
             folder.rmdir()
+
+
+def require_no_recording(out: Path) -> None:
+    """Raise SlamError where the folder of a run or a comparison is that of a recording."""
+    if (found := format_of(out)) is not None:
+        raise SlamError(f"{out}: holds a recording (format {found}); give another --out")
 
 
 def _short(text: str) -> str:

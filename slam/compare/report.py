@@ -74,7 +74,7 @@ def _pictures(group: Group) -> Iterator[tuple[str, str]]:
     runs = [RunData.read(run.folder, run.trial.backend) for run in shown]
     of_seed = f", seed {trial.seed}" if is_world(trial.sequence) else ""
     yield f"Paths{of_seed}.", _svg(drawn(runs, "path"))
-    if "nees_per_dof" in known:
+    if "ratio_start" in known:
         text = f"Error of the pose{of_seed} (solid), and the σ that each back end claims (dashed)."
         yield text, _svg(drawn(runs, "errors"))
 

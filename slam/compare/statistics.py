@@ -62,11 +62,19 @@ def difference(metric: Metric, reference: Array, other: Array, tests: int = 1) -
     if metric.better == "one":  # the same for half and double
         compared = [np.abs(np.log10(np.maximum(each, 1e-12))) for each in values]
     d = compared[1] - compared[0]
-    first, second, mean = (float(each.mean()) if len(d) else float("nan") for each in (*values, d))
+    first, second = (mean_of(metric, each) for each in values)
+    mean = float(d.mean()) if len(d) else float("nan")
     half = reach(len(d), tests) * float(d.std(ddof=1)) if len(d) > 1 else float("nan")
     if len(d) > 1 and mean and (d == d[0]).all() and 2.0 ** len(d) < 2 * tests / (1 - LEVEL):
         half = float("inf")  # counts that are all alike have no spread; by their signs alone it may be chance
     return Difference(metric, len(d), int((~both).sum()), first, second, mean, mean - half, mean + half)
+
+
+def mean_of(metric: Metric, values: Array) -> float:
+    """The mean of values (N,), the root of the mean square where one is ideal, as of NEES; NaN where there are none."""
+    if not len(values):
+        return float("nan")
+    return float(np.sqrt(np.mean(values**2)) if metric.better == "one" else values.mean())
 
 
 def reach(pairs: int, tests: int = 1) -> float:

@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from slam.compare.plan import REPLAY, Plan
-from slam.compare.statistics import Difference, difference, reach
+from slam.compare.plan import Plan
+from slam.compare.statistics import Difference, difference, mean_of, reach
 from slam.compare.sweep import Run
 from slam.files import read_object, write_text
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import pair
 from slam.run.outputs import csv_number, csv_rows
-from slam.run.results import COMPARED, DOUBTED, Metric, number, truth_is_exact, verdict, verdict_of_run
+from slam.run.results import COMPARED, DOUBTED, METRICS, Metric, errors_of_truth, number, verdict, verdict_of_run
 from slam.run.run_data import RunData
 
 DIFFERENCE_COLUMNS = (
@@ -68,12 +68,17 @@ class Group:
         """A figure by trial (N,), NaN where the run failed or has none."""
         return np.array([run.metrics.get(key, np.nan) for run in self.runs[backend]], float)
 
-    def mean_and_sd(self, backend: str, key: str) -> tuple[float, float]:
-        """Mean and standard deviation of a figure over the runs that have it; NaN where unknown."""
-        values = self.values(backend, key)
+    def mean_and_sd(self, backend: str, metric: Metric) -> tuple[float, float]:
+        """`mean_of` a figure and its standard deviation over the runs that have it; NaN where unknown."""
+        values = self.values(backend, metric.key)
         values = values[np.isfinite(values)]
-        mean = float(values.mean()) if len(values) else float("nan")
-        return mean, float(values.std(ddof=1)) if len(values) > 1 else float("nan")
+        return mean_of(metric, values), float(values.std(ddof=1)) if len(values) > 1 else float("nan")
+
+    @property
+    def first_metrics(self) -> list[Metric]:
+        """Of these those of the first table: the main ones, and those in which a back end is better or worse."""
+        told = {key for key, each in self.compared.items() for d in each.values() if d.verdict in ("better", "worse")}
+        return [m for m in self.metrics if m.main or m.key in told]
 
     def failures(self, backend: str) -> int:
         """Number of runs that failed."""
@@ -120,7 +125,7 @@ def row(group: Group, metric: Metric) -> list[dict[str, str]]:
     """
     cells = []
     for backend in group.runs:
-        mean, sd = group.mean_and_sd(backend, metric.key)
+        mean, sd = group.mean_and_sd(backend, metric)
         cell = {"mean": metric.show(mean), "sd": f"± {metric.show(sd, mean)}" if np.isfinite(mean + sd) else ""}
         cell |= {"verdict": "", "difference": "", "interval": ""}
         if (d := group.compared.get(metric.key, {}).get(backend)) is not None:
@@ -193,8 +198,8 @@ def honesty(group: Group) -> list[str]:
     """Whether the covariances of each back end hold, by the means over its runs; where that is open, why."""
     said = {}
     for backend in group.runs:
-        keys = dict.fromkeys(key for run in group.runs[backend] for key in run.metrics)
-        means = {key: group.mean_and_sd(backend, key)[0] for key in keys}
+        known = {key for run in group.runs[backend] for key in run.metrics}
+        means = {m.key: group.mean_and_sd(backend, m)[0] for m in METRICS if m.key in known}
         said[backend] = verdict(means, group.trials - group.failures(backend))
         if not said[backend] and (summary := _summary(group.runs[backend])):
             said[backend] = verdict_of_run(summary)
@@ -202,14 +207,12 @@ def honesty(group: Group) -> list[str]:
 
 
 def truth_line(group: Group) -> str:
-    """Which frames of the first run have a true pose, and which errors of it are counted; empty where none has."""
+    """Which frames of the first run have a true pose, and which errors of its own; empty where none has."""
     summary = next(filter(None, map(_summary, group.runs.values())), {})
-    truth, known = summary.get("truth"), (summary.get("accuracy") or {}).get("online", {}).get("poses with truth")
-    if not truth or known is None or summary["format"] == "synthetic":
+    errors, known = errors_of_truth(summary), (summary.get("accuracy") or {}).get("online", {}).get("poses with truth")
+    if not errors or known is None:
         return ""
-    sigma = f"σ {number(1e3 * truth['translation'])} mm and {number(np.degrees(truth['rotation']))}°"
-    errors = "is taken as exact" if truth_is_exact(summary) else f"has errors of {sigma}, which are counted"
-    return f"The true path {errors}; {known:.0f} of {summary['frames']} frames have it."
+    return f"{known:.0f} of {summary['frames']} frames have a true pose; its own errors that are counted: {errors}."
 
 
 def _summary(runs: Sequence[Run]) -> dict[str, Any]:
@@ -229,10 +232,3 @@ def caution(plan: Plan, trials: int) -> str:
         return f"{trials} trials can hardly show any difference; take --trials {_FEW} or more."
     scatter = f"{least:.2g} times its scatter from trial to trial"
     return f"With {trials} trials only a difference of {scatter} can be told from chance."
-
-
-def measurements(mode: str, reference: str) -> str:
-    """Which measurements the back ends were given, for captions."""
-    if mode == REPLAY:
-        return f"Replay: all back ends are given the measurements of {reference}'s closed loop"
-    return "Closed loop: each back end's predictions choose its matches"

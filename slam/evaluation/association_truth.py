@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from slam.data import IdArray
-from slam.geometry.camera import PinholeCamera
 from slam.geometry.se3 import Array, inverse, transform
 
 
@@ -23,9 +22,9 @@ class SurfacePoints:
         if not len(ids):
             return
         depth, objects = self._world.depth(frame), self._world.object_ids(frame)
-        local = surface_points(self._world.rig.left, depth, uv_left)
         column, row = _nearest_pixels(uv_left, depth.shape)
-        local[objects[row, column] > 0] = np.nan
+        still = (depth[row, column] > 0) & (objects[row, column] == 0)
+        local = self._world.rig.left.rays(uv_left) * np.where(still, depth[row, column], np.nan)[:, None]
         points = transform(self._world.ground_truth.poses[frame], local)
         self._points.update(zip(np.asarray(ids).tolist(), points))
 
@@ -50,14 +49,6 @@ class SurfacePoints:
         expected = self._world.rig.left.project(transform(inverse(self._world.ground_truth.poses[frame]), points))
         distance = np.linalg.norm(uv_left - expected, axis=1)
         return np.where(known, np.where(np.isfinite(distance), distance, np.inf), np.nan)
-
-
-def surface_points(camera: PinholeCamera, depth: np.ndarray, uv: Array) -> Array:
-    """Points (N, 3) [m] in camera coordinates that pixels (N, 2) show; NaN where nothing is."""
-    column, row = _nearest_pixels(uv, depth.shape)
-    z = np.where(depth[row, column] > 0, depth[row, column], np.nan).astype(float)
-    xy = camera.normalise(uv)
-    return np.column_stack([xy * z[:, None], z])
 
 
 def _nearest_pixels(uv: Array, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:

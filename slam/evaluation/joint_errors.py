@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.data import RecentPoses
 from slam.geometry.arrays import Array
 
 _DOF = 6
@@ -37,8 +38,10 @@ class JointErrors:
     frames: NDArray[np.intp]
 
     @classmethod
-    def of(cls, blocks: Sequence[Array], frames: NDArray[np.intp]) -> JointErrors:
+    def of(cls, blocks: Sequence[Array], frames: NDArray[np.intp]) -> JointErrors | None:
         """By covariances (K, 6, 6), for each frame, of the last K poses' errors with its own, which comes last."""
+        if not blocks or not all(map(len, blocks)):  # a back end that tells none, or a path without
+            return None
         by_lag = np.full((len(blocks), max(map(len, blocks)), _DOF, _DOF), np.nan)
         for k, its in enumerate(blocks):
             by_lag[k, : len(its)] = np.swapaxes(its[::-1], 1, 2)
@@ -89,3 +92,16 @@ def _gains(by_lag: Array, k: int, n: int) -> Array:
     inverse = np.divide(1.0, values, out=np.zeros(size), where=values > _NOTHING)
     gains[:, :n] = ((with_it / sigma) @ (axes * inverse) @ axes.T / sigma).reshape(_DOF, n, _DOF)
     return gains.reshape(_DOF, -1)
+
+
+def with_newest(recent: RecentPoses | None, stamps: Sequence[float]) -> Array:
+    """Covariances (K, 6, 6) of the errors of the last K frames' poses with the newest one's; of none where not told.
+
+    `stamps` are those of all frames so far, of which some may be no poses of the back end.
+    """
+    if recent is None:
+        return np.zeros((0, _DOF, _DOF))
+    n = min(len(recent), len(stamps))
+    apart = np.flatnonzero(recent.stamps[len(recent) - n :] != stamps[len(stamps) - n :])
+    first = len(recent) - n + (apart[-1] + 1 if len(apart) else 0)
+    return recent.covariance[_DOF * first :, -_DOF:].reshape(-1, _DOF, _DOF)

@@ -243,10 +243,7 @@ _NOT_SQUARE = 0.03  # guard: the same that digital cameras do not have; analog v
 def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
     """What is wrong with a principal point far from the middle, or pixels that are not square; empty for neither."""
     cameras = {"left": left, "right": right}
-    shares = {
-        side: np.array([2 * camera.u0 / (camera.width - 1), 2 * camera.v0 / (camera.height - 1)]) - 1
-        for side, camera in cameras.items()
-    }
+    shares = {side: _off_middle(camera) for side, camera in cameras.items()}
     every = np.concatenate(list(shares.values()))
     alike = bool(every.min() > _OFF_ALIKE or every.max() < -_OFF_ALIKE)
     for side, camera in cameras.items():
@@ -270,15 +267,30 @@ def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
 
 
 def oblong(*cameras: PinholeCamera) -> str:
-    """What to ask of cameras whose pixels are not square, as few are; empty where they are."""
+    """What to ask of cameras whose pixels are not square, as few are, or whose images may have been scaled in one way.
+
+    Empty where nothing says so: principal points are as near to the middle along rows as along columns.
+    """
     shares = [camera.fu / camera.fv - 1 for camera in cameras]
     share = min(shares, key=abs)  # where one alone is odd, rows disagree, which says more
-    if abs(share) <= _NOT_SQUARE:
-        return ""
-    return (
-        f"by the calibration the focal lengths along rows and columns differ by {100 * abs(share):.0f} %: pixels of "
-        "digital cameras are square; is one mistyped, or were images scaled in one way?"
-    )
+    if abs(share) > _NOT_SQUARE:
+        return (
+            f"by the calibration the focal lengths along rows and columns differ by {100 * abs(share):.0f} %: pixels "
+            "of digital cameras are square; is one mistyped, or were images scaled in one way?"
+        )
+    off = np.array([_off_middle(camera) for camera in cameras])
+    for name, one, other in (("width", off[:, 0], off[:, 1]), ("height", off[:, 1], off[:, 0])):
+        if np.abs(one).min() > _OFF_ALIKE and np.ptp(one) < _OFF_ALIKE and np.abs(other).max() < _OFF_ALIKE / 2:
+            return (
+                f"the principal points are at {50 * (1 + one.mean()):.0f} % of the images' {name}, and in the middle "
+                "the other way: were images scaled or cut in one way alone, and the calibration is for others?"
+            )
+    return ""
+
+
+def _off_middle(camera: PinholeCamera) -> Array:
+    """How far the principal point is from the middle of the images (2,), in halves of their width and height."""
+    return np.array([2 * camera.u0 / (camera.width - 1), 2 * camera.v0 / (camera.height - 1)]) - 1
 
 
 def floats(what: str, values: ArrayLike | None) -> Array:

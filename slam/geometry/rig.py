@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,6 +15,9 @@ from slam.geometry.se3 import Array, is_rotation, nearest_rotation, pose
 
 _ZERO_DISPARITY = 1024  # fixed: OpenCV's CALIB_ZERO_DISPARITY, whose module differs between its versions
 MINIMAL_POINTS = 3  #: fixed: points that fix a pose
+
+#: By which a rig is recognised, of files that are of one rig alone.
+NUMBERS = ("width", "height", "focal", "baseline", "u0", "v0", "right_u0")
 
 #: What is said of cameras above each other, where their images are not at hand.
 NOT_SIDE_BY_SIDE = (
@@ -374,3 +378,22 @@ def rectify(rig: StereoRig) -> RectifiedRig:
     return RectifiedRig(
         rig, StereoRig.rectified_pair(f, u0, v0, rig.baseline, rig.width, rig.height, doffs), R_left, R_right
     )
+
+
+def rig_numbers(rig: StereoRig) -> dict[str, float]:
+    """The rectified cameras as delivered, to which all corrections refer, by the names of `NUMBERS` [px], [m]."""
+    r = rig.rectified.rig
+    values = r.width, r.height, r.left.fu, r.baseline, r.left.u0, r.left.v0, r.right.u0
+    return dict(zip(NUMBERS, map(float, values)))
+
+
+def rig_difference(there: Mapping[str, float], here: Mapping[str, float], share: float = 1e-5) -> str:
+    """The first number of two rigs that differs, in words; empty if none does.
+
+    Numbers of one calibration, written and read, differ by less than the default `share` of their size. Only those
+    that are in `there` are compared.
+    """
+    for name, value in there.items():
+        if abs(value - here[name]) > share * max(abs(value), abs(here[name])):
+            return f"{name} {value:g} there, {here[name]:g} here"
+    return ""

@@ -13,7 +13,7 @@ import numpy as np
 from slam.errors import TrajectoryError
 from slam.files import read_text, write_text
 from slam.geometry.se3 import Array, nearest_rotation, pose, quaternion, rotation_from_quaternion, so3_exp
-from slam.naming import count, widest
+from slam.naming import count
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,7 +79,8 @@ class Trajectory:
             import matplotlib.pyplot as plt
 
             axis = plt.figure(layout="constrained").add_subplot()
-        across, up = map("xyz".index, plane) if plane else widest(self.positions)
+        extent = np.ptp(self.positions, axis=0) if len(self) else np.array([1.0, 0.0, 1.0])
+        across, up = map("xyz".index, plane) if plane else sorted(np.argsort(-extent, kind="stable")[:2])
         axis.plot(self.positions[:, across], self.positions[:, up], **options)
         if "label" in options:
             axis.legend()
@@ -131,13 +132,13 @@ class Trajectory:
     @classmethod
     def read_tum(cls, path: str | Path) -> Trajectory:
         """Read ``stamp tx ty tz qx qy qz qw`` lines; raises TrajectoryError with the file's name."""
-        rows = _read_table(path, None, 8)
+        rows = _read_table(path, None, "stamp tx ty tz qx qy qz qw")
         return cls._of_file(path, rows[:, 0], pose(_rotations(path, rows[:, 4:8]), rows[:, 1:4]))
 
     @classmethod
     def read_kitti(cls, path: str | Path) -> Trajectory:
         """Read rows of twelve numbers; stamps are the row numbers."""
-        rows = _read_table(path, None, 12)
+        rows = _read_table(path, None, "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz")
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         poses[:, :3] = rows[:, :12].reshape(-1, 3, 4)
         return cls._of_file(path, np.arange(len(rows), dtype=float), poses)
@@ -145,7 +146,7 @@ class Trajectory:
     @classmethod
     def read_euroc(cls, path: str | Path) -> Trajectory:
         """Read EuRoC's ground truth CSV (body frame): the first eight columns."""
-        rows = _read_table(path, ",", 8)
+        rows = _read_table(path, ",", "timestamp x y z qw qx qy qz")
         R = _rotations(path, rows[:, [5, 6, 7, 4]])
         return cls._of_file(path, rows[:, 0] * 1e-9, pose(R, rows[:, 1:4]))
 
@@ -173,8 +174,8 @@ def _rotations(path: str | Path, quaternions: Array) -> Array:
     return rotation_from_quaternion(quaternions)
 
 
-def _read_table(path: str | Path, delimiter: str | None, columns: int) -> Array:
-    """Finite numbers of a text table with at least `columns` columns."""
+def _read_table(path: str | Path, delimiter: str | None, columns: str) -> Array:
+    """Finite numbers of a text table with at least these columns."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # an empty file is an error below
@@ -184,9 +185,10 @@ def _read_table(path: str | Path, delimiter: str | None, columns: int) -> Array:
         if delimiter is None and "," in text.splitlines()[-1]:
             raise TrajectoryError(f"{path}: its columns are apart by commas, and have to be by spaces") from error
         raise TrajectoryError(f"{path}: cannot be read as a trajectory: {error}") from error
-    if rows.shape[1] < columns or not len(rows):
-        raise TrajectoryError(f"{path}: such a trajectory has {columns} columns, found {rows.shape[1]}")
-    if not np.isfinite(rows[:, :columns]).all():
+    needed = len(columns.split())
+    if rows.shape[1] < needed or not len(rows):
+        raise TrajectoryError(f"{path}: its {needed} columns must be {columns}, found are {rows.shape[1]}")
+    if not np.isfinite(rows[:, :needed]).all():
         raise TrajectoryError(f"{path}: a value is not finite")
     return rows
 

@@ -37,10 +37,11 @@ def checksum_of(frame: StereoFrame) -> tuple[int, int] | None:
 
     Images of a camera that stands still differ by their noise.
     """
-    left, right = frame.left, frame.right
-    if not shows_something(left):
-        return None
-    return crc32(left.tobytes()), crc32(right.tobytes()) if isinstance(right, np.ndarray) else 0
+    left, right = (
+        crc32(np.ascontiguousarray(image).data) if shows_something(image) else None
+        for image in (frame.left, frame.right)
+    )
+    return None if left is None else (left, right or 0)
 
 
 class Extractor:

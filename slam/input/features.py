@@ -59,7 +59,7 @@ def documented(features: Any, rig: StereoRig) -> StereoFeatures:
     u, v = columns["uv_left"].T
     if not features.rectified and np.mean([*(v >= size[1]), False]) > _SHARE and (u < size[1]).all():
         raise MeasurementError("features: uv_left lies below the image: are its columns, x and y, exchanged?")
-    looks = columns["descriptors"].astype(float)
+    looks = columns["descriptors"]
     length = median(np.sqrt(np.einsum("nd,nd->n", looks, looks))) if looks.any() else 1.0
     if abs(length - 1) > _SHARE:
         raise MeasurementError(

@@ -14,7 +14,7 @@ from slam.calibration.saved import CERTAIN, agreement, agreement_in_words, joint
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import CalibrationError, ConfigurationError
-from slam.geometry.rig_numbers import rig_difference, rig_numbers
+from slam.geometry.rig import rig_difference, rig_numbers
 from slam.geometry.se3 import Array
 from slam.outputs import Output, require_outputs
 from slam.run.outputs import write_json
@@ -98,10 +98,7 @@ def calibrate(
 
 
 def _run(
-    sequence: StereoSequence,
-    config: SystemConfig,
-    frames: tuple[int, int | None],
-    on_frame: Callable[[FrameResult], None],
+    sequence: StereoSequence, config: SystemConfig, frames: tuple[int, int | None], on_frame: OnFrame
 ) -> tuple[dict[str, Any], RigEvidence | None]:
     """What one recording says alone, and its evidence without any prior; None where no motion was seen."""
     system = StereoSlam(sequence.rig, _FRONTEND, _BACKEND, config=config)

@@ -13,6 +13,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, log
 from slam.input.warnings import REPEATED
 from slam.models import MotionModel
+from slam.run.options import RunOptions
 from slam.run.summary import RunRecord
 from slam.tracks.step import ENOUGH_FEATURES, HIDDEN
 
@@ -32,22 +33,14 @@ _MANY = 0.1  # guard: share of frames that were not tracked, from which on it is
 
 
 def outcome(
-    record: RunRecord,
-    rig: StereoRig,
-    warnings: Sequence[str] = (),
-    in_map: bool = False,
-    dropped: int = 0,
-    doubt: str = "",
-    driving: bool = False,
-    backend: str = "",
-    recorded: bool = False,
-) -> str:
+    record: RunRecord, rig: StereoRig, options: RunOptions, warnings: Sequence[str] = (), dropped: int = 0,
+    doubt: str = "", recorded: bool = False,
+) -> str:  # fmt: skip
     """What to say of a run in which many frames were not tracked, with the likely cause; empty for others.
 
-    The first frame is not counted: there is no map yet, unless the run began `in_map`. The first of the `warnings` is
+    The first frame is not counted: there is no map yet, unless the run began in one. The first of the `warnings` is
     taken for a cause; repeated images are counted instead. `dropped` frames of a live run came too late; `doubt`, of
-    `motion_doubt`, is a cause where nothing else is one. `backend` names one of somebody's own, which may be the cause.
-    What was `recorded` has no images.
+    `motion_doubt`, is a cause where nothing else is one. What was `recorded` has no images.
     """
     untracked = [row for row, status in enumerate(record.statuses) if row and status != _TRACKED]
     frames, missed = len(record.statuses) - 1, len(untracked)
@@ -56,11 +49,11 @@ def outcome(
     frozen = 2 * record.repeated > missed
     cause = next((line for line in warnings if REPEATED not in line), "")
     if not cause and not frozen:
-        cause = _starved(record, untracked, rig, in_map, recorded) or doubt
+        cause = _starved(record, untracked, rig, options.prior_map is not None, recorded) or doubt
         if not cause and dropped < frames:  # where most came, the gaps are hardly all of it
-            cause = _unexplained(record, rig, driving)
-            if backend:
-                cause = f"the back end {backend} (`python -m slam.testing {backend}` checks it); or {cause}"
+            cause = _unexplained(record, rig, options.kind == "driving")
+            if ":" in (name := options.backend):  # somebody's own
+                cause = f"the back end {name} (`python -m slam.testing {name}` checks it); or {cause}"
     causes = [cause] if cause else []
     if frozen:
         causes.append(f"in {record.repeated} of them {REPEATED}")
@@ -107,7 +100,7 @@ def _starved(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map
 
 def _unexplained(record: RunRecord, rig: StereoRig, driving: bool) -> str:
     """What may be the cause where each step gave enough, with what is known."""
-    depth, speeds = _depth(record), _speeds(record)
+    depth = _depth(record)
     apart = f"the cameras are {rig.baseline:.3g} m apart"
     if np.isfinite(depth):
         apart += f" and what they see is {_rounded(depth)} m away in the median"
@@ -116,14 +109,10 @@ def _unexplained(record: RunRecord, rig: StereoRig, driving: bool) -> str:
             f"by the calibration {apart}, which no hand carries: a baseline in another unit"
             f"{in_units(rig.baseline)}, or a vehicle's camera without --kind driving"
         )
-    moved, vehicle = "", "" if driving else "a vehicle's camera without --kind driving, "
-    if len(speeds):
-        turn, way = speeds.max(axis=0)
-        most = f"{_rounded(way)} m/s and turned at up to {_rounded(np.degrees(turn))}°/s"
-        moved = f" (where it was tracked the camera moved at up to {most})"
+    vehicle = "" if driving else "a vehicle's camera without --kind driving, "
     return (
-        f"features are found in both images, but not again in the next frame: {vehicle}frames too far apart{moved}, "
-        "images that are not in order of time or have other times than theirs (fps=…, times=…), or the calibration of "
+        f"features are found in both images, but not again in the next frame: {vehicle}frames too far apart, images "
+        "that are not in order of time or have other times than theirs (fps=…, times=…), or the calibration of "
         f"another camera or in another unit: by it {apart}"
     )
 
@@ -134,12 +123,13 @@ def scale_doubt(record: RunRecord, rig: StereoRig, driving: bool = False) -> str
     A baseline that is k times too long makes path, speed and distances k times too large, and no residual shows it.
     Empty where they are possible, or too few are known.
     """
-    speeds, depth = _speeds(record), _depth(record)
+    velocities, both, _ = _velocities(record)
+    speeds, depth = np.linalg.norm(velocities[both, 3:], axis=1), _depth(record)
     if len(speeds) < _LEAST_CHANGES or not np.isfinite(depth):
         return ""
     apart = f"by the calibration the cameras are {rig.baseline:.3g} m apart"
     asked = f"{apart}; is that in metres?{in_units(rig.baseline)}"
-    speed = float(np.median(speeds[:, 1]))
+    speed = float(np.median(speeds))
     if speed <= _FASTEST[driving] and depth >= _NEAREST[driving]:
         return asked if rig.baseline > _WIDEST[driving] else ""
     carrier = "no vehicle does" if driving else "no camera in a hand does (is it a vehicle's: --kind driving?)"
@@ -195,12 +185,6 @@ def _velocities(record: RunRecord) -> tuple[Array, BoolArray, Array]:
     measured, durations = np.array(record.measured, bool), np.diff(record.stamps)
     poses = np.array(record.poses).reshape(-1, 4, 4)
     return log(inverse(poses[:-1]) @ poses[1:]) / durations[:, None], measured[1:] & measured[:-1], durations
-
-
-def _speeds(record: RunRecord) -> Array:
-    """Turn rates [rad/s] and speeds [m/s] (N, 2) where two successive frames were tracked."""
-    velocities, both, _ = _velocities(record)
-    return np.linalg.norm(velocities[both].reshape(-1, 2, 3), axis=2)
 
 
 def _depth(record: RunRecord) -> float:

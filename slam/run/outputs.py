@@ -18,7 +18,7 @@ from slam.data import Estimate, FrameResult
 from slam.errors import SlamError
 from slam.files import RowFile, reason, remove_file, write_text
 from slam.geometry.se3 import Array, angles, transform
-from slam.geometry.trajectory import Trajectory, tum_line
+from slam.geometry.trajectory import tum_line
 from slam.object_data import MovingObject
 from slam.run.schema import FILES, FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, OLD_LANDMARKS, OLD_TABLE, STAGES, header
 
@@ -103,11 +103,6 @@ class RunFiles(ExitStack):
             found.update(zip(np.asarray(keyframe.landmarks)[left].tolist(), at))
         lines = ([i, *(f"{x:.9g}" for x in found[i])] for i in sorted(found))
         write_text(self.folder / OLD_LANDMARKS, csv_rows([header(OLD_TABLE), *lines]))
-
-
-def write_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """Write a path at once or not at all; raises SlamError where it cannot be written."""
-    write_text(path, "".join(tum_line(s, T) for s, T in zip(trajectory.stamps, trajectory.poses)))
 
 
 def write_json(path: Path, tree: dict[str, Any]) -> None:

@@ -19,7 +19,6 @@ import numpy as np
 from slam.errors import ConfigurationError, SlamError
 from slam.files import noting_inputs, whole_file
 from slam.geometry.se3 import Array, inverse, transform
-from slam.geometry.stamps import pair
 from slam.geometry.trajectory import TruthNoise
 from slam.naming import unknown
 from slam.outputs import Output, require_outputs
@@ -127,9 +126,8 @@ def drawn(runs: Sequence[RunData], kind: str) -> Figure:
     maps = [f"map {k}" for k in range(len(runs[:_MOST_MAPS] if kind == "summary" else runs))]
     wide = max(10.0, 4.4 * (1 + len(maps))) if kind == "summary" else 5.0 * len(maps) if kind == "map" else 5.2
     below: list[Any] = [["position", "time"], ["rotation", "time"]]
-    layouts: dict[
-        str, tuple[list[Any], list[float]]
-    ] = {  # names of panels, nested ones with margins of their own, and heights of the rows [in]
+    # names of panels, nested ones with margins of their own, and heights of the rows [in]
+    layouts: dict[str, tuple[list[Any], list[float]]] = {
         "summary": ([[[["path", *maps]]], ["key"], [below]], [wide / (1 + len(maps)), 0.5, 4.2]),
         "map": ([maps, ["key"] * len(maps)], [5.0, 0.5]),
         "path": ([["path"]], [4.8]),
@@ -169,20 +167,16 @@ def _title(runs: Sequence[RunData]) -> str:
 # ------------------------------------------------------------------------------------------------ path and map
 
 
-def backend_colours(backends: Sequence[str]) -> list[str]:
-    """A colour for each of the runs in a picture, by the names of their back ends.
+def _coloured(runs: Sequence[RunData]) -> list[tuple[RunData, str, float]]:
+    """Runs with their colours and widths of lines: where lines coincide, each is seen beside the one drawn over it.
 
     A built-in back end has the same colour in all pictures, in whatever order. Others, and further runs of the same
     back end, have the next colour that is left.
     """
-    left = cycle([*_OTHERS, *(colour for name, colour in _BACKENDS.items() if name not in backends)])
+    names = [run.backend for run in runs]
+    left = cycle([*_OTHERS, *(colour for name, colour in _BACKENDS.items() if name not in names)])
     own = dict(_BACKENDS)
-    return [own.pop(name) if name in own else next(left) for name in backends]
-
-
-def _coloured(runs: Sequence[RunData]) -> list[tuple[RunData, str, float]]:
-    """Runs with their colours and widths of lines: where lines coincide, each is seen beside the one drawn over it."""
-    colours = backend_colours([run.backend for run in runs])
+    colours = [own.pop(name) if name in own else next(left) for name in names]
     return list(zip(runs, colours, 1.2 + 1.2 * np.arange(len(runs))[::-1]))
 
 
@@ -204,9 +198,7 @@ def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
     shown = [0, 2] if extent[1] < extent.max() else [0 if extent[0] > extent[2] else 2, 1]
     signs = factor * np.array([1.0, 1.0 if shown[1] == 2 else -1.0])  # y points down
     if truth is not None:
-        axis.plot(
-            *(signs * truth[:, shown]).T, "--", color=_TRUTH, lw=1.0, label=f"true path{_of_which(runs)}", zorder=3
-        )
+        axis.plot(*(signs * truth[:, shown]).T, "--", color=_TRUTH, lw=1.0, label="true path", zorder=3)
     for run, colour, width in _coloured(runs):
         online, final = (signs * points[:, shown] for points in paths[run.name])
         axis.plot(*np.where(run.measured[:, None], online, np.nan).T, color=colour, lw=1.2 * width, alpha=0.75,
@@ -231,17 +223,6 @@ def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
     axis.legend(framealpha=0.8)
     axis.locator_params(axis="x", nbins=6)
     axis.grid(color="0.9", lw=0.5)
-
-
-def _of_which(runs: Sequence[RunData]) -> str:
-    """Whose true path is drawn, where runs have different ones."""
-    known = [(run.name, run.truth) for run in runs if run.truth is not None]
-    for _, other in known[1:]:
-        name, first = known[0]
-        rows = pair(first.stamps, other.stamps, 1e-6)
-        if not np.allclose(first.poses[rows >= 0], other.poses[rows[rows >= 0]], atol=1e-6):
-            return f" of {name}; others have another"
-    return ""
 
 
 def _unit(largest: float) -> tuple[float, str]:
@@ -327,16 +308,15 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
                 axis.axvspan(start, start, color=colour, alpha=0.2)
             for start in every[~np.isin(every, time)]:
                 axis.axvspan(start, start + 1.1 * np.median(np.diff(every)), color="0.92", lw=0, zorder=0)
-        values = np.concatenate([line.get_ydata() for line in axis.lines])
+        curves = [np.asarray(line.get_ydata()) for line in axis.lines]
+        values = np.concatenate(curves)
         values = values[values > 0]
         if len(values):
-            axis.set_yscale("log")
+            axis.set_yscale("log", nonpositive="clip")  # a curve goes down to the axis
             top = (2.0 if k or len(runs) == 1 else 6.0) * float(values.max())  # room for a legend
-            middle = min(float(np.median(np.asarray(line.get_ydata()))) for line in axis.lines)  # of the lowest curve
-            bottom = max(0.7 * float(values.min()), min(top * 10.0**-_DECADES, 0.3 * middle))
+            lowest = min(float(np.median(curve)) for curve in curves)
+            bottom = max(0.7 * float(values.min()), min(top * 10.0**-_DECADES, 0.3 * lowest))
             axis.set_ylim(bottom, top)
-            for line in axis.lines:  # a curve ends at the axis
-                line.set_ydata(np.clip(line.get_ydata(), bottom, top))
             axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if top < 100 * bottom else (1,)))
             axis.yaxis.set_major_formatter("{x:g}")
             axis.yaxis.set_minor_formatter("")
@@ -345,14 +325,13 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
         end = max(float(np.ptp(run.online.stamps)) for run in runs)  # also where the truth begins later
         axis.set_xlim(-0.01 * end, 1.01 * end or 1.0)
     axes[0].tick_params(labelbottom=False)
-    noisy = any(run.truth is not None and run.truth_noise != TruthNoise() for run in runs)
+    noises = [run.truth_noise for run in runs if run.truth is not None and not run.truth_is_exact]
     title = "Online error since the start (solid), claimed σ (dashed)"
-    title += "\nσ with that of the truth; grey: the truth is doubtful" if noisy else ""
-    title += (
-        "\nthe true path and the estimated one do not fit"
-        if any(run.summary.get("truth_doubt") for run in runs)
-        else ""
-    )
+    if noises:
+        exact = all(noise == TruthNoise() for noise in noises)
+        title += "\nthe truth counts as exact" if exact else "\nσ with that of the truth; grey: the truth is doubtful"
+    if any(run.summary.get("truth_doubt") for run in runs):
+        title += "\nthe true path and the estimated one do not fit"
     axes[0].set_title(title if known else "Claimed σ of the online pose; no true path is known")
     axes[-1].set_xlabel("time [s]")
     if len(runs) > 1:

@@ -21,10 +21,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from slam.calibration.model import Revision, RigCorrection, RigModel
-from slam.checks import LATEST_STAMP, MOST_ID
+from slam.checks import FARTHEST_PIXEL, LATEST_STAMP, MOST_ID
 from slam.data import FrameResult, IdArray, Observations
 from slam.errors import MeasurementError, SequenceError, SlamError
-from slam.files import json_text, read_bytes, unpack, whole_file
+from slam.files import Kind, json_text, read_bytes, require_arrays, unpack, whole_file
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
@@ -34,9 +34,16 @@ from slam.models import EstimatorModels, MotionModel, ObjectModels, SlideModel, 
 _HEADER = {"format": "surf-stereo-slam recording", "version": 3}
 _LARGEST = 2**32  # bytes of a file
 
-#: Arrays of a file: kind of numbers (i whole, f others) and dimensions; the last three may be missing.
-_ARRAYS = {"numbers": "i1", "stamps": "f1", "rows": "i2", "pixels": "f2",
-           "corrections": "f2", "truth_stamps": "f1", "truth_poses": "f3"}  # fmt: skip
+_FAR = 1e9  # guard: of other numbers
+_ARRAYS = {
+    "numbers": Kind(np.int64, "f", 0, MOST_ID), "stamps": Kind(np.float64, "f", -LATEST_STAMP, LATEST_STAMP),
+    "rows": Kind(np.int64, "m3", 0, MOST_ID),
+    "pixels": Kind(np.float64, "m4", -FARTHEST_PIXEL, FARTHEST_PIXEL, "unknown"),
+}  # fmt: skip
+_OPTIONAL = {
+    "corrections": Kind(np.float64, "fn", -_FAR, _FAR), "truth_poses": Kind(np.float64, "t44", -_FAR, _FAR),
+    "truth_stamps": Kind(np.float64, "t", -LATEST_STAMP, LATEST_STAMP),
+}  # fmt: skip
 
 
 def save_recording(recording: Recording, path: str | Path) -> None:
@@ -79,8 +86,10 @@ def load_recording(path: str | Path) -> Recording:
     content = read_bytes(path, _LARGEST, expected="a recording, which `slam run --record FILE.npz` leaves")
     if content.startswith(b"surf-stereo-slam map"):
         raise SequenceError(f"{path}: a saved map, which a run starts in with --map, no recording")
-    arrays = unpack(content, str(path), error=SequenceError)
+    arrays = unpack(content, str(path), ("header", *_ARRAYS), SequenceError)
     try:
+        kinds = _ARRAYS | {name: kind for name, kind in _OPTIONAL.items() if name in arrays}
+        require_arrays(arrays, kinds, "recording", SequenceError)
         return _recording(arrays)
     except KeyError as error:
         raise SequenceError(f"{path}: the recording lacks {error.args[0]!r}") from error
@@ -89,17 +98,11 @@ def load_recording(path: str | Path) -> Recording:
 
 
 def _recording(arrays: dict[str, np.ndarray]) -> Recording:
-    header = json_text(str(arrays.get("header", "{}")), "header", SequenceError)
+    header = json_text(str(arrays["header"]), "header", SequenceError)
     if not isinstance(header, dict) or header.get("format") != _HEADER["format"]:
         raise SequenceError("is no recording of this version")
     if header["version"] != _HEADER["version"]:
         raise SequenceError(f"is a recording of version {header['version']}; this one reads {_HEADER['version']}")
-    for key, kind in _ARRAYS.items():
-        if key in arrays or key in ("numbers", "stamps", "rows", "pixels"):
-            found = arrays[key]
-            if found.ndim != int(kind[1]) or found.dtype.kind not in ("iu" if kind[0] == "i" else "f"):
-                raise SequenceError(f"{key} is of type {found.dtype} with {found.ndim} dimensions")
-            arrays[key] = found.astype(np.int64 if kind[0] == "i" else float)
     tree, models = header["rig"], header["models"]
     left, right = (PinholeCamera(**{**tree[s], "distortion": tuple(tree[s]["distortion"])}) for s in ("left", "right"))
     rig = StereoRig(left, right, np.array(tree["R"], float), np.array(tree["b"], float))
@@ -117,19 +120,14 @@ def _recording(arrays: dict[str, np.ndarray]) -> Recording:
 def _frames(arrays: Mapping[str, np.ndarray], rig: StereoRig) -> tuple[RecordedFrame, ...]:
     numbers, stamps, rows, pixels = (arrays[key] for key in ("numbers", "stamps", "rows", "pixels"))
     count = len(stamps)
-    if len(numbers) != count:
-        raise SequenceError("stamps must be finite and increase, with a number each")
-    if rows.shape[1:] != (3,) or pixels.shape != (len(rows), 4):
-        raise SequenceError("rows and pixels differ in length")
     place = 3 * rows[:, 0] + rows[:, 1]
-    inside = (rows[:, :2] >= 0).all() and (rows[:, 1] <= 2).all() and (place < 3 * count).all()
-    if not inside or (np.diff(place) < 0).any():
+    if (rows[:, 1] > 2).any() or (rows[:, 0] >= count).any() or (np.diff(place) < 0).any():
         raise SequenceError(f"frames of rows must ascend from 0 to {count - 1}")
     revisions: list[Revision | None] = [None] * count
     if "corrections" in arrays:
         corrections, model = arrays["corrections"], RigModel(rig)
-        if corrections.shape != (count, len(model.names)) or not np.isfinite(corrections).all():
-            raise SequenceError("corrections must be finite, with a row for each stamp")
+        if corrections.shape[1] != len(model.names):
+            raise SequenceError(f"corrections must have {len(model.names)} columns")
         every = [RigCorrection(model, row) for row in corrections]
         for k in np.flatnonzero((corrections[1:] != corrections[:-1]).any(axis=1)).tolist():
             revisions[k + 1] = Revision(every[k], every[k + 1])

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from slam.bodies.estimator import FRAMES
-from slam.data import FrameResult, FrameStatus, StereoFeatures, UpdateStatus
+from slam.data import FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
 from slam.geometry.rig import MINIMAL_POINTS, measurement_rows
 from slam.input.features import Rectification
 from slam.interfaces import Backend, RecentBackend, RevisingBackend
@@ -54,6 +54,17 @@ def replay(
         yield result
 
 
+def _status(report: UpdateReport, begins: bool) -> tuple[FrameStatus, str]:
+    """How a frame ended, and why it was not tracked; where it `begins`, there was no landmark before."""
+    if report.status is UpdateStatus.FAILED:
+        return FrameStatus.FAILED, report.reason
+    if begins:
+        return FrameStatus.STARTED, ""
+    if len(report.used) < MINIMAL_POINTS:
+        return FrameStatus.PREDICTED, report.reason or f"only {len(report.used)} landmarks matched"
+    return FrameStatus.TRACKED, ""
+
+
 def _step(
     inside: Rectification, backend: Backend, k: int, frame: RecordedFrame, size: int, threshold: float, hypotheses: int
 ) -> FrameResult:
@@ -82,14 +93,7 @@ def _step(
     estimate = checked(backend, "estimate", backend.estimate(landmarks=False))
     recent = backend.recent(FRAMES + 1) if isinstance(backend, RecentBackend) else None
     times.append(time.perf_counter())
-    status, reason = FrameStatus.TRACKED, ""
-    if report.status is UpdateStatus.FAILED:
-        status, reason = FrameStatus.FAILED, report.reason
-    elif not size and len(added):
-        status = FrameStatus.STARTED
-    elif len(report.used) < MINIMAL_POINTS:
-        status = FrameStatus.PREDICTED
-        reason = report.reason or f"only {len(report.used)} landmarks matched"
+    status, reason = _status(report, begins=not size and len(added) > 0)
     count, every = len(seen), len(seen) + len(frame.added)
     nothing = np.full(every, np.nan)
     features = StereoFeatures(

@@ -81,7 +81,7 @@ METRICS = (
            "compared run"),
     Metric("body_error_deg", "motion of a body, rotation error", "deg", "objects/bodies/*/ME/rotation median [deg]",
            "lower"),
-    Metric("body_nees_per_dof", "NEES / 6 of bodies (1 is right)", "", "objects/bodies/*/mean NEES", "one"),
+    Metric("body_ratio", "errors / claimed σ of bodies (1 is right)", "", "objects/bodies/*/mean NEES", "one"),
     Metric("loops_closed", "loops closed", "", "loops/closed", shown="compared run picture"),
     Metric("loops_refused", "loops refused", "", "loops/refused"),
     Metric("ate_online_m", "online path error (ATE, aligned)", "mm", "accuracy/online/ATE RMSE [m]", "lower",
@@ -95,13 +95,13 @@ METRICS = (
     Metric("segment_percent", "online drift by distance (RPE)", "%", "accuracy/online/segment error [%]", "lower",
            "compared run"),
     Metric("sigma_m", "claimed σ of the last position", "mm", "final_sigma_m", shown="run picture brief"),
-    Metric("ratio", "errors over claimed σ (1 is right)", shown="run"),
-    Metric("nees_10m_per_dof", "NEES / 6 over 10 m (1 is right)", "", "consistency/NEES over 10 m", "one",
+    Metric("ratio", "errors / claimed σ (1 is right)", shown="run"),
+    Metric("ratio_10m", "errors / claimed σ over 10 m (1 is right)", "", "consistency/NEES over 10 m", "one",
            "compared main"),
-    Metric("nees_1m_per_dof", "NEES / 6 over 1 m (1 is right)", "", "consistency/NEES over 1 m", "one"),
-    Metric("nees_per_dof", "NEES / 6 from the start (1 is right)", "", "consistency/mean NEES", "one",
+    Metric("ratio_1m", "errors / claimed σ over 1 m (1 is right)", "", "consistency/NEES over 1 m", "one"),
+    Metric("ratio_start", "errors / claimed σ from the start (1 is right)", "", "consistency/mean NEES", "one",
            "compared main"),
-    Metric("nees_100m_per_dof", "NEES / 6 over 100 m (1 is right)", "", "consistency/NEES over 100 m", "one"),
+    Metric("ratio_100m", "errors / claimed σ over 100 m (1 is right)", "", "consistency/NEES over 100 m", "one"),
     Metric("exact_calibration", "cameras without errors, of which covariances count some", "",
            f"consistency/{EXACT}", shown=""),
     Metric("pixels_alone", "covariances of pixel noise alone", "", f"consistency/{PIXELS_ALONE}", shown=""),
@@ -121,35 +121,31 @@ COMPARED = tuple(metric for metric in METRICS if "compared" in metric.shown)
 
 _LEAST = {"compiling": 0.05, "loops_closed": 0.0}  # up to which a figure is not worth a row
 
-#: NEES by key, with what it is over; the best to judge by first: errors from the start add up.
-_NEES = {
-    "nees_10m_per_dof": "over 10 m",
-    "nees_1m_per_dof": "over 1 m",
-    "nees_per_dof": "from the start",
-    "nees_100m_per_dof": "over 100 m",
+#: Errors over claimed σ by key, with what they are over; the best to judge by first: errors from the start add up.
+_RATIOS = {
+    "ratio_10m": "over 10 m",
+    "ratio_1m": "over 1 m",
+    "ratio_start": "from the start",
+    "ratio_100m": "over 100 m",
 }
-_KEYS = {over: key for key, over in _NEES.items()}
 _OF_A_PATH = {"loops_closed", "path_m", "speed", "sigma_m"}
-_FEW = 0.5  # a NEES over less than this share of the stretches is no figure: they are hardly a fair choice
 
 
 def figures(summary: Mapping[str, Any]) -> dict[str, float]:
     """What a run's summary says, by key of `METRICS`; what it does not say is left out."""
     bodies = [body for body in _at(summary, "objects/bodies", {}).values() if body["frames in view"]]
-    honest, found = summary.get("consistency") or {}, {}
+    found: dict[str, float] = {}
     for m in METRICS:
         before, each, own = m.place.partition("/*/")
         values = [_at(body, own) for body in bodies] if each else [_at(summary, before)] if before else []
         known = [float(value) for value in values if value is not None]
-        few = (honest.get(f"no covariance {_NEES.get(m.key)}") or 0.0) > _FEW
-        if known and not few and (bodies or "moving" not in m.key):  # what is found of nothing is no figure
-            found[m.key] = float(np.mean(known)) / (6 if "nees" in m.key else 1)
+        if known and (bodies or "moving" not in m.key):  # what is found of nothing is no figure
+            mean = float(np.mean(known))
+            found[m.key] = float(np.sqrt(mean / 6)) if m.better == "one" else mean  # of NEES, where 6 is right
     if frames := summary.get("frames", 0):
         found["tracked"] = _measured(summary) / frames
     followed = bool((summary.get("status") or {}).get("tracked"))
     found[DOUBTED] = float(bool(summary.get("doubt")) or (frames > 1 and not followed))
-    if truth_is_exact(summary):
-        found["exact_truth"] = 1.0
     if ratios := _ratios(found):
         found["ratio"] = next(iter(ratios.values()))
     if not followed:  # poses that are the motion model's have no loops, path or σ
@@ -166,6 +162,8 @@ def rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, list[str
         others = [f"{n} {name}" for name, n in summary["status"].items() if name not in ("tracked", "started")]
         tracked.append(", ".join([f"{_measured(summary)} of {summary['frames']}", *others]))
     yield "frames tracked", tracked
+    if any(truths := [errors_of_truth(summary) for summary in summaries]):
+        yield "errors of the true path itself", [text or "–" for text in truths]
     found = list(map(figures, summaries))
     for metric in METRICS:
         values = [one.get(metric.key, np.nan) for one in found]
@@ -185,13 +183,18 @@ def facts(summary: Mapping[str, Any], brief: bool = False) -> str:
     words = [f"{m.label} {m.show(found[m.key])} {m.unit}".rstrip() for m in shown]
     doubt = "do not trust this path, see the run's warnings" if summary.get("doubt") else ""
     covariances = verdict_of_run(summary).partition(":" if brief else " (")[0]
-    return "; ".join(filter(None, [doubt, *words, covariances]))
+    truth = errors_of_truth(summary) and f"errors of the true path itself: {errors_of_truth(summary)}"
+    return "; ".join(filter(None, [doubt, *words, covariances, truth]))
 
 
-def truth_is_exact(summary: Mapping[str, Any]) -> bool:
-    """Whether the true path, other than a world's, is given without errors of its own."""
+def errors_of_truth(summary: Mapping[str, Any]) -> str:
+    """The errors that the true path is counted with, in words; empty for that of a world, and where none is known."""
     truth = summary.get("truth")
-    return truth is not None and not any(truth.values()) and summary.get("format") != "synthetic"
+    if truth is None or summary.get("format") == "synthetic":
+        return ""
+    if not any(truth.values()):
+        return "none, it is taken as exact"
+    return f"σ {number(1e3 * truth['translation'])} mm, {number(float(np.degrees(truth['rotation'])))}°"
 
 
 def _measured(summary: Mapping[str, Any]) -> int:
@@ -207,8 +210,7 @@ def _at(tree: Any, place: str, default: Any = None) -> Any:
 
 def _ratios(found: Mapping[str, float]) -> dict[str, float]:
     """How many times as large as claimed errors are, and over what; the one to judge by first."""
-    known = ((over, found.get(key, np.nan)) for key, over in _NEES.items())
-    return {over: float(np.sqrt(nees)) for over, nees in known if np.isfinite(nees)}
+    return {over: found[key] for key, over in _RATIOS.items() if np.isfinite(found.get(key, np.nan))}
 
 
 def verdict(found: Mapping[str, float], runs: int = 1) -> str:
@@ -234,8 +236,6 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     band = f"({low:.2f} to {high:.2f} in 95 % of {of})"
     if exact:
         others.append("they count errors of the calibration, and this world's cameras have none")
-    if found.get("exact_truth"):
-        others.append("the true path is taken as exact, so its own errors count as the estimate's")
     if found.get("pixels_alone"):
         others.append("they count pixel noise alone, and no errors of the calibration")
     return "; ".join([f"covariances {word}: {times} {band}", *others])
@@ -246,7 +246,7 @@ def verdict_of_run(summary: Mapping[str, Any]) -> str:
     text, honest = verdict(figures(summary)), summary.get("consistency") or {}
     if not text and summary.get("truth_doubt"):
         return "covariances are not judged: the true path and the estimated one do not fit, see the run's warnings"
-    doubtful = {over: share for over in _NEES.values() if (share := honest.get(f"doubtful truth {over}"))}
+    doubtful = {over: share for over in _RATIOS.values() if (share := honest.get(f"doubtful truth {over}"))}
     if not text and not honest.get("dof"):
         return ""
     if not text and _at(summary, "loops/known"):
@@ -264,10 +264,9 @@ def verdict_of_run(summary: Mapping[str, Any]) -> str:
             "frame"
         )  # fmt: skip
         return f"covariances cannot be judged: {why}"
-    judged = next(iter(_ratios(figures(summary))))
-    exact = honest.get(f"{BY_KEY[_KEYS[judged]].place.partition('/')[2]}, truth exact")
-    if exact is not None and np.isfinite(exact):
-        text += f"; with a truth without errors of its own {number(float(np.sqrt(exact / 6)))} times"
+    if truth := errors_of_truth(summary):
+        text += f"; errors of the true path itself that are counted: {truth}"
+        text += "" if any(summary["truth"].values()) else " (truth_sigma= gives it some)"
     if doubtful:
         over, share = next(iter(doubtful.items()))
         text += f"; not judged: {100 * share:.0f} % of the stretches {over}, where the true path is doubtful"

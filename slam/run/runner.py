@@ -25,7 +25,7 @@ from slam.interfaces import Frontend
 from slam.outputs import require_outputs
 from slam.run.options import RunOptions, origin, versions
 from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
-from slam.run.outputs import RunFiles, write_json, write_trajectory
+from slam.run.outputs import RunFiles, write_json
 from slam.run.recording import RecordedFrame, Recording, save_recording
 from slam.run.replay import replay
 from slam.run.schema import schema
@@ -220,9 +220,9 @@ class _Run:
         if record.stamps:
             final = attempt(system.trajectory)
             if final is not None:
-                attempt(write_trajectory, out / "trajectory_final.txt", final)
+                attempt(final.write_tum, out / "trajectory_final.txt")
             if pairs := attempt(with_truth, record.trajectory, sequence):
-                attempt(write_trajectory, out / "truth.txt", pairs[1])
+                attempt(pairs[1].write_tum, out / "truth.txt")
             if (estimate := attempt(system.estimate)) is not None:
                 attempt(files.write_landmarks, estimate, record.seen, record.last_seen, getattr(system, "atlas", None))
             found = attempt(results_of, sequence, system, record, final or Trajectory.empty(), score)
@@ -257,10 +257,8 @@ class _Run:
         warnings, driving = getattr(self.system, "warnings", ()), options.kind == "driving"
         no_path = scale_doubt(record, rig, driving)
         doubt = no_path or motion_doubt(record, options.config.models.motion, driving)
-        in_map, dropped = options.prior_map is not None, self.live.dropped if self.live else 0
-        own = options.backend if ":" in options.backend else ""
-        recorded = isinstance(self.sequence, Recording)
-        tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving, own, recorded)
+        dropped, recorded = self.live.dropped if self.live else 0, isinstance(self.sequence, Recording)
+        tracking = outcome(record, rig, options, warnings, dropped, doubt, recorded)
         if doubt and not tracking:
             logger.warning("%s", doubt)
         if isinstance(self.system, StereoSlam) and not self.system.doubt and self.system.calibration.warning:

@@ -11,7 +11,7 @@ import numpy as np
 
 from slam.data import CommonError, Estimate, FrameResult
 from slam.evaluation.consistency import EXACT, PIXELS_ALONE, are_covariances
-from slam.evaluation.joint_errors import JointErrors
+from slam.evaluation.joint_errors import JointErrors, with_newest
 from slam.evaluation.objects import ObjectScore
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import Array
@@ -44,7 +44,7 @@ class RunRecord:
     statuses: list[str] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
     common: list[CommonError] = field(default_factory=list)
-    with_last: list[Array] = field(default_factory=list)  # covariances of the last poses' errors with each one's own
+    with_newest: list[Array] = field(default_factory=list)  # covariances of the last poses' errors with each one's own
     measured: list[bool] = field(default_factory=list)
     milliseconds: list[dict[str, float]] = field(default_factory=list)
     compiled_before: float = field(default_factory=compile_clock.seconds)  # [s]
@@ -82,7 +82,7 @@ class RunRecord:
         self.poses.append(result.estimate.T_world_left)
         self.covariances.append(result.estimate.covariance)
         self.common.append(result.common)
-        self.with_last.append(_with_last(result, self.stamps))
+        self.with_newest.append(with_newest(result.recent, self.stamps))
         self.measured.append(result.status.measured)
         self.rejected += len(result.report.rejected)
         self.used += len(result.report.used)
@@ -127,15 +127,14 @@ def results_of(
     singular = _singular(record, final)
     online, steps = path.select(measured), np.diff(path.positions, axis=0)
     noise, doubt = getattr(sequence, "truth_noise", TruthNoise()), ""
-    exact = noise == TruthNoise() and sequence.format != "synthetic"  # the truth is taken as such
-    if sequence.ground_truth is not None and exact and not getattr(system, "doubt", ""):  # else the path tells nothing
-        doubt = truth_doubt(online, sequence.ground_truth)
+    of_camera = sequence.format != "synthetic" and not noise.mounting  # in a file of the camera's own poses
+    if sequence.ground_truth is not None and of_camera and not getattr(system, "doubt", ""):  # else nothing tells it
+        doubt = truth_doubt(online, sequence.ground_truth, noise.translation)
     if doubt:
         logger.warning("%s", doubt)
     speeds = np.linalg.norm(steps, axis=1) / np.diff(path.stamps)
     rows = np.flatnonzero(measured)
-    common = [record.common[row] for row in rows]
-    joint = JointErrors.of(record.with_last, rows) if record.with_last and all(map(len, record.with_last)) else None
+    common, joint = [record.common[row] for row in rows], JointErrors.of(record.with_newest, rows)
     found: dict[str, Any] = {
         "path_length_m": path.length,
         "speed_m_per_s": float(np.median(speeds)) if len(speeds) else None,
@@ -170,17 +169,6 @@ def results_of(
     if score is not None:
         found["objects"] = score.summary()
     return found | _times(record)
-
-
-def _with_last(result: FrameResult, stamps: list[float]) -> Array:
-    """Covariances (K, 6, 6) of the errors of the last K frames' poses with the newest one's; of none not told."""
-    recent = result.recent
-    if recent is None:
-        return np.zeros((0, 6, 6))
-    n = min(len(recent), len(stamps))
-    apart = np.flatnonzero(recent.stamps[len(recent) - n :] != stamps[len(stamps) - n :])
-    first = len(recent) - n + (apart[-1] + 1 if len(apart) else 0)  # frames that are no poses of the back end
-    return recent.covariance[6 * first :, -6:].reshape(-1, 6, 6)
 
 
 def _singular(record: RunRecord, final: Trajectory) -> int:

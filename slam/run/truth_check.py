@@ -42,14 +42,16 @@ class _Fit(NamedTuple):
     turn: float  # of the body against the camera [deg]
     lever: float  # its distance from the camera [m]
     motions: int
+    size: float = 1.0  # of the estimated ones [m], root mean square
 
 
-def truth_doubt(own: Trajectory, truth: Trajectory) -> str:
+def truth_doubt(own: Trajectory, truth: Trajectory, sigma: float = 0.0) -> str:
     """Why covariances cannot be judged by a true path, in a line: it looks wrong, or is of another scale.
 
     Args:
         own: the estimated path, of measured poses.
         truth: the true path as it was given, at stamps of its own.
+        sigma: of each of its coordinates [m]; what that explains is no mistake.
 
     Returns:
         the line, empty where the paths agree or too little is known.
@@ -57,7 +59,7 @@ def truth_doubt(own: Trajectory, truth: Trajectory) -> str:
     if len(own) > _ROWS:
         own = own.select(np.linspace(0, len(own) - 1, _ROWS).astype(int))
     given = _fit(own, truth, 0.0, free="")
-    if given is None or given.error < _EXPLAINS * _FINE:  # errors are no less than _FINE
+    if given is None or given.error < _EXPLAINS * max(_FINE, sigma / given.size):  # errors are no less than _FINE
         return ""
     w_first = quaternion(truth.poses[:, :3, :3])[:, [1, 2, 3, 0]]
     as_w_first = pose(rotation_from_quaternion(w_first), truth.positions)
@@ -150,7 +152,8 @@ def _fit(own: Trajectory, truth: Trajectory, shift: float, free: str = "scale bo
             lever = np.linalg.solve(rows.T @ rows + prior, rows.T @ (tb @ R.T / scale - ta).ravel())
     off_t, off_w = tb @ R.T / scale - ta - J @ lever, wb @ R.T - wa
     error = max(_FINE, float(np.hypot(_rms(off_t) / size, _rms(off_w) / turn)))
-    return _Fit(error, scale, float(np.degrees(np.linalg.norm(so3_log(R)))), float(np.linalg.norm(lever)), len(A))
+    turned = float(np.degrees(np.linalg.norm(so3_log(R))))
+    return _Fit(error, scale, turned, float(np.linalg.norm(lever)), len(A), size)
 
 
 def _rms(vectors: Array) -> float:

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
 from urllib.parse import quote
 
 import numpy as np
@@ -28,17 +28,17 @@ from slam.errors import (
 from slam.files import expanded, note_input, reason
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import pair
-from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.geometry.trajectory import Trajectory
 from slam.naming import nearest, unknown
 from slam.query import read_query
 from slam.sequences import euroc, folders, kitti, ros
 from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, logger, read_masks, turned
 from slam.sequences.folders import VIDEO_SUFFIXES
 from slam.sequences.images import IMAGE_SUFFIXES
-from slam.sequences.options import RECORDED, Options
+from slam.sequences.options import RECORDED, Options, truth_noise
 from slam.sequences.tables import require_truth
 
-__all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
+__all__ = ["RecordedSequence", "Sequence", "format_of", "formats", "is_live", "open_sequence", "with_mask"]
 
 _LOOKED_AT = 500  # entries below a folder that is no sequence, at each of so many levels
 _LEVELS = 4
@@ -48,33 +48,22 @@ _MOST = 0.95  # share of images with a true pose, below which a line says how ma
 _NEAR = 0.02  # [s] of a true pose's stamp to an image's, as `slam.evaluation.metrics.associate` has it
 
 
-class _Format(NamedTuple):
-    matches: Callable[[Path], bool]  # whether a folder or file looks like it
-    open: Callable[[Path, Options, FaultLog], RecordedSequence]
-    description: str
+Matches = Callable[[Path], bool]  # whether a folder or file looks like a format
+Opener = Callable[[Path, Options, FaultLog], RecordedSequence]
 
-
-#: In the order in which they are tried.
-_FORMATS = {
-    "ros": _Format(
-        ros.matches_folder, ros.open_folder, "ROS 1 and 2: .bag, .mcap and .db3 files, and the folders of ROS 2"
-    ),
-    "euroc": _Format(euroc.matches_folder, euroc.open_folder, "EuRoC and other ASL folders: mav0/cam0, mav0/cam1"),
-    "kitti-raw": _Format(kitti.matches_drive, kitti.open_folder, "KITTI raw drives: image_00/data, image_01/data"),
-    "kitti": _Format(kitti.matches_folder, kitti.open_folder, "KITTI odometry sequences: image_0, image_1, calib.txt"),
-    "folders": _Format(
-        folders.matches_folder,
-        folders.open_folder,
-        "two folders or videos (left, right), or one with both (layout=sbs), and a calibration",
-    ),
+#: How each format is known and opened, in the order in which they are tried.
+_FORMATS: dict[str, tuple[Matches, Opener]] = {
+    "ros": (ros.matches_folder, ros.open_folder),
+    "euroc": (euroc.matches_folder, euroc.open_folder),
+    "kitti-raw": (kitti.matches_drive, kitti.open_folder),
+    "kitti": (kitti.matches_folder, kitti.open_folder),
+    "folders": (folders.matches_folder, folders.open_folder),
 }
 
 
-def formats() -> dict[str, str]:
-    """Names of the formats with a line on each."""
-    camera = "live cameras: camera:0 (both images side by side), camera:0,1, or addresses"
-    worlds = "built-in worlds: synthetic:NAME?key=value&key=value"
-    return {name: known.description for name, known in _FORMATS.items()} | {"camera": camera, "synthetic": worlds}
+def formats() -> tuple[str, ...]:
+    """Names of the formats."""
+    return (*_FORMATS, "camera", "synthetic")
 
 
 def open_sequence(path: str | Path, format: str | None = None, quiet: bool = False) -> Sequence:
@@ -130,14 +119,13 @@ def _open_folder(text: str, format: str | None, quiet: bool) -> RecordedSequence
     note_input(folder)
     lines: list[str] = []
     with FaultLog(lines, quiet=True) as faults:  # above an error nothing is said
-        found = (
-            _FORMATS[name].open(folder, options, faults) if name in _FORMATS else _own(name, folder, options, faults)
-        )
+        _, opener = _FORMATS.get(name, (None, partial(_own, name)))
+        found = opener(folder, options, faults)
         home = folder if folder.is_dir() else folder.parent
         masks = read_masks(options.get("mask"), home, found.rig)
         if "truth" in options:
             given = _truth(home / expanded(options["truth"]), found.stamps, lines)
-            found = replace(found, ground_truth=given, truth_noise=TruthNoise())
+            found = replace(found, ground_truth=given, truth_noise=truth_noise(options.get("truth_sigma", "0")))
         swap = options.get("swap", False)
         options.require_read(f"{folder} is read as {name}")
     for line in () if quiet else lines:
@@ -198,8 +186,9 @@ def _exists(text: str) -> bool:
         return False
 
 
-def _format_of(folder: Path) -> str | None:
-    return next((name for name, known in _FORMATS.items() if known.matches(folder)), None)
+def format_of(folder: Path) -> str | None:
+    """The format of the recording that a folder, or file, looks like; None where it is none."""
+    return next((name for name, (matches, _) in _FORMATS.items() if matches(folder)), None)
 
 
 def _format_asked(folder: Path, query: str, text: str) -> str | None:
@@ -208,8 +197,12 @@ def _format_asked(folder: Path, query: str, text: str) -> str | None:
     if ros.matches_folder(folder):
         return "ros"
     if not folder.exists():
-        what = "file or folder" if folder.suffix else "folder"
-        raise SequenceError(f"{folder}: there is no such {what}{_hint_name(text)}")
+        from slam import worlds
+
+        name, mark, options = text.partition("?")
+        near = nearest(name, worlds.names())
+        hint = f" (did you mean 'synthetic:{near}{mark}{options}'?)" if near else ""
+        raise SequenceError(f"{folder}: there is no such {'file or folder' if folder.suffix else 'folder'}{hint}")
     if not folder.is_dir() and "layout" not in named:
         hint = "; give the folder that holds both cameras' images, unpacked"
         if folder.suffix.lower() in VIDEO_SUFFIXES:
@@ -218,16 +211,7 @@ def _format_asked(folder: Path, query: str, text: str) -> str | None:
         raise SequenceError(f"{folder}: a file where the sequence's folder should be{hint}")
     if folder.is_dir() and not any(folder.iterdir()):
         raise SequenceError(f"{folder}: the folder is empty")
-    return "folders" if named & {"left", "right", "layout"} else _format_of(folder)
-
-
-def _hint_name(text: str) -> str:
-    """A world with a similar name than what was asked for."""
-    from slam import worlds
-
-    name, mark, query = text.partition("?")
-    near = nearest(name, worlds.names())
-    return f" (did you mean 'synthetic:{near}{mark}{query}'?)" if near else ""
+    return "folders" if named & {"left", "right", "layout"} else format_of(folder)
 
 
 def _hint_near(folder: Path) -> str:
@@ -235,7 +219,7 @@ def _hint_near(folder: Path) -> str:
     with suppress(OSError, SequenceError):
         for level in range(1, _LEVELS + 1):  # 2011_09_26/…_sync, dataset/sequences/03
             inside = islice(folder.glob("/".join("*" * level)), _LOOKED_AT)
-            below = sorted(str(path.relative_to(folder)) for path in inside if _format_of(path))
+            below = sorted(str(path.relative_to(folder)) for path in inside if format_of(path))
             if len(below) == 1:
                 return f"; below it is {below[0]}: give that"
             if below:
@@ -243,7 +227,7 @@ def _hint_near(folder: Path) -> str:
                 return f"; below it are {', '.join(below[:_LISTED])}{more}: give one of them"
     images = any(path.suffix.lower() in IMAGE_SUFFIXES for path in islice(folder.iterdir(), _LOOKED_AT))
     for parent in islice(folder.parents, _LEVELS):  # mav0/cam0/data
-        if (name := _format_of(parent)) is not None and (images or name != "folders"):
+        if (name := format_of(parent)) is not None and (images or name != "folders"):
             return f"; it is a part of one: give {parent} (format {name})"
     if images:
         return f"; where each image holds both cameras: '{folder.name}?layout=sbs'; else name both: ?left=…&right=…"

@@ -175,7 +175,7 @@ def _read(path: Path, images: Size | None, cameras: tuple[str, str]) -> tuple[Ma
     """What a file holds, and whose form it is where its entries do not tell; CalibrationError where it is no rig's."""
     if path.suffix.lower() in _NO_TEXT:
         raise CalibrationError(f"{path}: no text: write K1, D1, K2, D2, R and T with cv2.FileStorage (docs/guide.md)")
-    text = _text(path).strip()
+    text = _text(path)
     if kitti := re.search(r"^(P|P_rect_0)\d[: ]+[^!\[\s]", text, re.MULTILINE):
         rows = read_kitti(path)
         names = [f"{kitti[1]}{camera}" for camera in cameras]
@@ -184,18 +184,15 @@ def _read(path: Path, images: Size | None, cameras: tuple[str, str]) -> tuple[Ma
         P = {f"P{side}": rows[name] for side, name in enumerate(names)}
         return P | {"size": rows.get(f"S_rect_0{cameras[0]}")}, "KITTI's"
     with naming(path):
-        if text.startswith("<"):
-            return _read_xml(text), ""
-        if text.startswith("[") and "[STEREO]" in text.upper():
+        if text.lstrip().startswith("<"):
+            return _read_xml(text.strip()), ""
+        if text.lstrip().startswith("[") and "[STEREO]" in text.upper():
             return _read_zed(text, images), "ZED's"
-    root = read_yaml(path)
-    with naming(path):
+        root = _read_yaml(text, "JSON" if path.suffix.lower() == ".json" else "YAML")
         if {"evidence", "residual_scale", "self_calibration"} & set(root):
             what = "errors of a rig, as `slam calibrate` or a run found them, not a rig: see --calibration"
             raise CalibrationError(what)
-        if "cameraData" in root:
-            return _read_depthai(root), "depthai's"
-    return root, ""
+        return (_read_depthai(root), "depthai's") if "cameraData" in root else (root, "")
 
 
 def _text(path: Path) -> str:
@@ -219,11 +216,10 @@ def read_kitti(path: Path) -> dict[str, Array]:
     return rows
 
 
-def read_yaml(path: Path) -> Mapping[str, Any]:
-    """The mapping in a YAML (or JSON) file, all values as texts; also OpenCV's dialect: ``%YAML:1.0``, ``.Nan``."""
+def _read_yaml(text: str, kind: str) -> Mapping[str, Any]:
+    """The mapping in a text in YAML (or JSON), all values as texts; also OpenCV's dialect: ``%YAML:1.0``, ``.Nan``."""
     import yaml
 
-    text = _text(path)
     if text.startswith("%YAML:"):
         text = "\n" + text.partition("\n")[2]  # rows keep their numbers
     text = re.sub(r"(?i)(?<!\w)\.(nan|inf)\b", r"\1", text)
@@ -234,15 +230,13 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
             if depth > _DEEPEST or isinstance(event, yaml.AliasEvent):
                 what = "nested too deeply" if depth > _DEEPEST else "no aliases are read"
                 row = event.start_mark.line + 1  # type: ignore[union-attr]
-                raise CalibrationError(f"{path}, row {row}: {what} in a calibration")
+                raise CalibrationError(f"row {row}: {what} in a calibration")
         root = next(yaml.load_all(text, loader), None)  # of messages that ROS prints, a line ends each
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
-        where = f", row {mark.line + 1}" if mark else ""
-        kind = "JSON" if path.suffix.lower() == ".json" else "YAML"
-        raise CalibrationError(f"{path}{where}: no valid {kind}") from error
+        raise CalibrationError((f"row {mark.line + 1}: " if mark else "") + f"no valid {kind}") from error
     if not isinstance(root, Mapping):
-        raise CalibrationError(f"{path}: no calibration in this file")
+        raise CalibrationError("no calibration in this file")
     return root
 
 

@@ -6,6 +6,7 @@ import math
 import os
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -72,17 +73,15 @@ class CameraSequence:
         self._wanted = [options.get(name) for name in ("width", "height", "fps")]
         self._wait = options.get("wait", WAIT)
         self._origin = time.time() - time.monotonic()  # since 1970 when the monotonic clock was zero [s]
-        devices = self._open()
-        try:
+        with self._opened() as devices:
             paths = calibration_files(Path.cwd(), options)
             _, left, _ = self._waited_for(devices, "it is open, but gives no images")  # some take a moment
-            self.rig = read_rig(paths, (left.shape[1], left.shape[0]), options)
-            self._masks = read_masks(options.get("mask"), Path.cwd(), self.rig)
-        except SequenceError as error:
-            hint = "; ask the camera for another size with width=… and height=…" if "images are" in str(error) else ""
-            raise SequenceError(f"{self.name}: {str(error).removeprefix(f'{self.name}: ')}{hint}") from None
-        finally:
-            _release(devices)
+            try:
+                self.rig = read_rig(paths, (left.shape[1], left.shape[0]), options)
+                self._masks = read_masks(options.get("mask"), Path.cwd(), self.rig)
+            except SequenceError as error:
+                hint = "; ask the camera for another size with width=… and height=…"
+                raise SequenceError(f"{self.name}: {error}{hint if 'images are' in str(error) else ''}") from None
 
     def __len__(self) -> int:
         raise TypeError(f"{self.name}: a camera has no number of frames")
@@ -97,38 +96,32 @@ class CameraSequence:
         return self._frames(start, stop)
 
     def _frames(self, start: int, stop: int | None) -> Iterator[StereoFrame]:
-        devices, index, last, expected = self._open(), 0, -math.inf, recorded_size(self.rig)
-        try:
-            with FaultLog(self.warnings) as faults:
-                while stop is None or index < stop:
-                    pair = self._read(devices)
-                    if pair is None:
-                        began = time.monotonic()
-                        faults.report("silent", f"{self.name}: no more frames; they are waited for {self._wait:g} s")
-                        pair = self._waited_for(devices, f"no frames for {self._wait:g} s (see wait=…)", anew=True)
-                        faults.report("back", f"{self.name}: frames again after {time.monotonic() - began:.1f} s")
-                    stamp, left, right = pair
-                    if left.shape[::-1] != expected:  # as of one that was opened again
-                        was = f"they were {size_text(expected)}, as in the calibration"
-                        raise SequenceError(f"{self.name}: images are {size_text(left.shape[::-1])} now; {was}")
-                    if stamp > last:  # the clock of the machine may have been set back
-                        last = stamp
-                        if index >= start:
-                            yield as_used(index, stamp, left, right, self.rig, self._masks)
-                        index += 1
-        finally:
-            _release(devices)
+        index, last, expected = 0, -math.inf, recorded_size(self.rig)
+        with self._opened() as devices, FaultLog(self.warnings) as faults:
+            while stop is None or index < stop:
+                pair = self._read(devices)
+                if pair is None:
+                    began = time.monotonic()
+                    faults.report("silent", f"{self.name}: no more frames; they are waited for {self._wait:g} s")
+                    pair = self._waited_for(devices, f"no frames for {self._wait:g} s (see wait=…)", anew=True)
+                    faults.report("back", f"{self.name}: frames again after {time.monotonic() - began:.1f} s")
+                stamp, left, right = pair
+                if left.shape[::-1] != expected:  # as of one that was opened again
+                    was = f"they were {size_text(expected)}, as in the calibration"
+                    raise SequenceError(f"{self.name}: images are {size_text(left.shape[::-1])} now; {was}")
+                if stamp > last:  # the clock of the machine may have been set back
+                    last = stamp
+                    if index >= start:
+                        yield as_used(index, stamp, left, right, self.rig, self._masks)
+                    index += 1
 
     def _waited_for(self, devices: list[Any], silent: str, anew: bool = False) -> Pair:
         """The next pair, of devices that are opened `anew` before each attempt; SequenceError where none comes."""
         began = time.monotonic()
         while True:
             if anew:
-                _release(devices)
-                try:
-                    devices[:] = self._open()
-                except SequenceError:
-                    devices.clear()
+                with suppress(SequenceError):
+                    self._open(devices)
             pair = self._read(devices)
             if pair is not None:
                 return pair
@@ -136,20 +129,24 @@ class CameraSequence:
                 raise SequenceError(f"{self.name}: {silent}")
             time.sleep(_AGAIN)
 
-    def _open(self) -> list[Any]:
-        """The devices: two, or one with both images side by side."""
+    @contextmanager
+    def _opened(self) -> Iterator[list[Any]]:
+        """The devices, two or one with both images side by side; released in the end."""
         devices: list[Any] = []
         try:
-            for address in self._addresses:
-                devices.append(open_device(address, *self._wanted))
-        except BaseException:
+            self._open(devices)
+            yield devices
+        finally:
             _release(devices)
-            raise
-        return devices
+
+    def _open(self, devices: list[Any]) -> None:
+        _release(devices)
+        for address in self._addresses:
+            devices.append(open_device(address, *self._wanted))
 
     def _read(self, devices: list[Any]) -> Pair | None:
         """The next pair, both grabbed before any is decoded, to be close in time; None where a camera gives none."""
-        if not devices or not all([device.grab() for device in devices]):
+        if len(devices) < len(self._addresses) or not all([device.grab() for device in devices]):
             return None
         stamp = self._origin + time.monotonic()
         images = [image for device in devices if (image := grabbed_image(device)) is not None]
@@ -161,8 +158,8 @@ class CameraSequence:
 
 
 def _release(devices: list[Any]) -> None:
-    for device in devices:
-        device.release()
+    while devices:
+        devices.pop().release()
 
 
 def open_device(address: str, width: float | None = None, height: float | None = None, fps: float | None = None) -> Any:

@@ -34,7 +34,17 @@ def open_folder(folder: Path, options: Options, faults: FaultLog) -> RecordedSeq
     """Open a sequence in EuRoC's format; `folder` holds ``mav0`` or is it."""
     root = _root(folder)
     times = told_times(folder, options, faults)
-    pairs, decode, size = open_images(_listings(root, faults), options, faults, times)
+    cameras = [root / cam for cam in _CAMERAS]
+    for camera in cameras:
+        if not camera.is_dir():
+            reason = "a file where a folder should be" if camera.exists() else "missing, two cameras are needed"
+            raise SequenceError(f"{camera}: {reason}")
+    if all((camera / "data.csv").exists() for camera in cameras):
+        sides = [_table(camera / "data.csv", faults) for camera in cameras]
+    else:
+        inside = [camera / "data" for camera in cameras]
+        sides = listed(inside, [image_names(images) for images in inside], faults)
+    pairs, decode, size = open_images(sides, options, faults, times)
     own = files_in(root, EUROC)
     rig = read_rig(calibration_files(folder, options, own), size, options)
     truth = _ground_truth(root, first_complete(own), faults)
@@ -46,18 +56,6 @@ def open_folder(folder: Path, options: Options, faults: FaultLog) -> RecordedSeq
 def _root(folder: Path) -> Path:
     """The folder that holds the cameras."""
     return folder / "mav0" if (folder / "mav0").is_dir() else folder
-
-
-def _listings(root: Path, faults: FaultLog) -> list[Listing]:
-    cameras = [root / cam for cam in _CAMERAS]
-    for camera in cameras:
-        if not camera.is_dir():
-            reason = "a file where a folder should be" if camera.exists() else "missing, two cameras are needed"
-            raise SequenceError(f"{camera}: {reason}")
-    if all((camera / "data.csv").exists() for camera in cameras):
-        return [_table(camera / "data.csv", faults) for camera in cameras]
-    folders = [camera / "data" for camera in cameras]
-    return listed(folders, [image_names(folder) for folder in folders], faults)
 
 
 def _table(table: Path, faults: FaultLog) -> Listing:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from slam.errors import ConfigurationError
 from slam.geometry.camera import UNITS
+from slam.geometry.trajectory import TruthNoise
 from slam.query import number, read_query, word
 
 #: Options of every format whose calibration is in a file that can be named.
 CALIBRATION = frozenset({"calibration", "unit", "rectified", "fisheye", "kind", "mask", "swap"})
 
 #: Options that every recorded format knows; which of them mean something depends on what is found in the folder.
-RECORDED = CALIBRATION | {"tolerance", "times", "fps", "left", "right", "layout", "truth"}
+RECORDED = CALIBRATION | {"tolerance", "times", "fps", "left", "right", "layout", "truth", "truth_sigma"}
 
 #: Frame rates that are believed [1/s].
 SLOWEST, FASTEST = 1e-3, 1e5
@@ -40,6 +42,14 @@ def value_of(name: str, text: str) -> Any:
     if name in _WORDS:
         return _WORDS[name][word(name, text, _WORDS[name])]
     return number(name, text, *_RANGES[name]) if name in _RANGES else text
+
+
+def truth_noise(text: str) -> TruthNoise:
+    """The errors of a true path, of each axis: ``METRES`` or ``METRES,DEGREES``; ConfigurationError for others."""
+    metres, comma, degrees = text.partition(",")
+    sigma = number("truth_sigma in metres", metres, 0.0, 100.0)
+    turned = number("truth_sigma in degrees", degrees, 0.0, 90.0) if comma else 0.0
+    return TruthNoise(rotation=math.radians(turned), translation=sigma)
 
 
 class Options(dict[str, Any]):

@@ -181,10 +181,6 @@ def pair_up(
     good = timed[increasing(stamps[timed])]
     untimed, unordered = len(rows) - len(timed), len(timed) - len(good)
     if 2 * len(good) < len(rows):
-        steps = np.diff(stamps[timed])
-        if len(steps) and not untimed and (steps <= 0).all():
-            how = "run backwards" if steps.any() else "stand still"
-            raise SequenceError(f"{source}: the times of {len(rows)} images {how}")
         what = f"{untimed} have no time and {unordered} one that does not increase"
         raise SequenceError(f"{source}: of {len(rows)} images {what}")
     if untimed:

@@ -101,16 +101,8 @@ def initial_pose_is_kept(factory: Factory) -> None:
     require(np.median(np.linalg.norm(error, axis=1)) < 0.5, "landmarks are not in the initial pose's world")
 
 
-def time_must_increase(factory: Factory) -> None:
-    """A stamp that is not finite or not later is refused, and does no harm."""
-    backend, _ = started(factory)
-    for stamp in (0.0, -1.0, float("nan"), float("inf")):
-        raises(MeasurementError, backend.predict, stamp, what=f"predict({stamp}) after 0.0")
-    require_same(backend.predict(DT).stamp, DT, "stamp of a prediction after refused ones")
-
-
 def misuse_is_refused(factory: Factory) -> None:
-    """Calls before the start, unknown options and ids, known ids added again, and rows without depth are refused."""
+    """Refused are calls before the start, stamps that do not increase, unknown options and ids, and impossible rows."""
     raises(ConfigurationError, factory, RIG, models=MODELS, no_such_option=1, what="unknown option")
     backend, seen = started(factory)
     for method, arguments in {"add": (seen,), "update": (seen,), "recent": (1,), "place": cloud([7])}.items():
@@ -124,6 +116,7 @@ def misuse_is_refused(factory: Factory) -> None:
         ("add", "with negative depth", replace(stranger, uv_right=stranger.uv_left + np.array([30.0, 0.0]))),
         ("remove", "of an unknown id", [999]),
         ("positions", "of an unknown id", np.array([999])),
+        *(("predict", f"({stamp}) after 0.0", stamp) for stamp in (0.0, -1.0, float("nan"), float("inf"))),
         ("predict", "", DT),
         ("update", "with an unknown id", stranger),
     ]

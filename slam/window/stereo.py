@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from slam.chi_square import chi_square_limits
 from slam.data import IdArray, IndexArray, Observations
 from slam.errors import MeasurementError
 from slam.geometry import kernels
@@ -122,6 +123,10 @@ class RectifiedMeasurement:
         local = local * np.minimum(1.0, farthest / np.maximum(local[:, 2:], 1e-300))
         back = np.linalg.inv(self.stereo.project(local)[1])
         return local, self.models.pixel_sigma**2 * back @ np.swapaxes(back, 1, 2), back @ self.field(z)
+
+    def limits(self, z: Array) -> Array:
+        """Limits (M,) of the gate on squared distances of residuals or measurements (M, 3), NaN where not measured."""
+        return chi_square_limits(np.isfinite(z).sum(axis=1), self.models.gate_probability)
 
     def visible(self, T: Array, points: Array) -> IndexArray:
         """Which points (N, 3) in the world are in the angle of view from a pose T (4, 4) (paper A, Fig. 3)."""

@@ -23,9 +23,9 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import so3_exp
 from slam.naming import unknown
 from slam.worlds.options import FAULTS, IMAGING, OBSERVATION, RECORDING, Option, option_table, parse_query
-from slam.worlds.scenes import SCENES, Scene, assemble
+from slam.worlds.scenes import SCENES, assemble
 from slam.worlds.sequence import WorldSequence
-from slam.worlds.world import World
+from slam.worlds.world import Scene, World
 
 __all__ = ["WorldSequence", "describe", "describe_common", "names", "open_world", "options"]
 
@@ -46,7 +46,7 @@ ReadMasks = Callable[[str, StereoRig], tuple[BoolArray | None, BoolArray | None]
 def open_world(text: str, read_masks: ReadMasks | None = None) -> WorldSequence:
     """The recording that a text such as ``"aisle?frames=200&seed=3"`` describes.
 
-    A world of one's own is ``"my_module:SCENE?frames=200"``, a `slam.worlds.scenes.Scene`. The option ``mask`` needs
+    A world of one's own is ``"my_module:SCENE?frames=200"``, a `slam.worlds.world.Scene`. The option ``mask`` needs
     what reads it, as `slam.open_sequence` gives it.
 
     Raises:
@@ -56,8 +56,6 @@ def open_world(text: str, read_masks: ReadMasks | None = None) -> WorldSequence:
     text = text.removeprefix("synthetic:")
     name, _, query = text.partition("?")
     values = parse_query(name, query, options(name))
-    if values["mask"] and read_masks is None:
-        raise ConfigurationError(f"{name}: 'mask' is an option for slam.open_sequence alone")
     key = tuple(sorted((k, v) for k, v in values.items() if k not in _RECORDING_ONLY))
     world = _build(name, key)
     told, recorded = world.rig, world
@@ -67,7 +65,9 @@ def open_world(text: str, read_masks: ReadMasks | None = None) -> WorldSequence:
         true = StereoRig(left, right, so3_exp(np.full(3, turn)) @ told.R, told.b)
         recorded = replace(world, rig=true)
     sequence = WorldSequence(text, recorded, values, told)
-    if values["mask"] and read_masks is not None:
+    if values["mask"]:
+        if read_masks is None:
+            raise ConfigurationError(f"{name}: 'mask' is an option for slam.open_sequence alone")
         sequence.masks = read_masks(values["mask"], told)
     return sequence
 
@@ -90,7 +90,7 @@ def _scene(name: str) -> Scene:
     if ":" in name:
         found = registry.resolve("worlds", name)
         if not isinstance(found, Scene):
-            raise ConfigurationError(f"world {name!r} is no slam.worlds.scenes.Scene")
+            raise ConfigurationError(f"world {name!r} is no slam.worlds.world.Scene")
         return found
     if name not in SCENES:
         raise UnknownNameError(unknown("world", name, tuple(SCENES)))

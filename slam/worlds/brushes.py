@@ -10,6 +10,7 @@ import numpy as np
 Colour = Iterable[float]  #: blue, green, red
 Rng = np.random.Generator
 Size = tuple[int, int]  #: rows, columns
+Spots = tuple[float, float, int]  #: how strong, how wide at most [m], and how many octaves
 Box = tuple[float, float, float, float]  #: left, top, width, height [texels]
 
 _LETTERS = "ABCDEFGHIJKLMNOPRSTUVWZ"
@@ -38,8 +39,8 @@ def tinted(light: np.ndarray, colour: Colour) -> np.ndarray:
     return np.asarray(cv2.merge([cv2.convertScaleAbs(light, alpha=float(c)) for c in colour]))
 
 
-def mottled(size: Size, rng: Rng, density: float, colour: Colour, *spots: tuple[float, float, int]) -> np.ndarray:
-    """A colour under uneven light: of each sort of `spots` how strong, how wide at most [m], and how many octaves."""
+def mottled(size: Size, rng: Rng, density: float, colour: Colour, spots: Iterable[Spots]) -> np.ndarray:
+    """A colour under uneven light, with some sorts of spots."""
     light: np.ndarray | int = 1
     for strength, wide, octaves in spots:
         light = light + strength * clouds(size, rng, wide * density, octaves)

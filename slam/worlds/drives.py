@@ -62,7 +62,7 @@ def sampled(path: Trajectory, values: Mapping[str, Any]) -> Trajectory:
     times = np.minimum(stamps * values["speed"], path.stamps[-1])
     after = np.clip(np.searchsorted(path.stamps, times), 1, len(path) - 1)
     nearest = after - (times - path.stamps[after - 1] < path.stamps[after] - times)
-    positions = np.stack([np.interp(times, path.stamps, x) for x in path.positions.T], axis=1)
+    positions = interpolated(times, path.stamps, path.positions)
     turns = Slerp(path.stamps, Rotation.from_matrix(path.poses[:, :3, :3]))(times)
     poses = pose(turns.as_matrix(), positions)
     exact = np.abs(path.stamps[nearest] - times) < 1e-6
@@ -106,14 +106,23 @@ class Road:
         return cls(course[new, :2], left[new], way[new], course)
 
 
+def _driven(places: Array) -> Array:
+    """How far places (N, D) [m] are along their way (N,) [m]."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
+
+
+def interpolated(at: Array, way: Array, places: Array) -> Array:
+    """Places (M, D) at so much of a way (M,), by those (N, D) that are known at `way` (N,)."""
+    return np.stack([np.interp(at, way, x) for x in places.T], axis=1)
+
+
 def _course(positions: Array) -> tuple[Array, Array]:
     """Distances along a path (N,) [m] in equal steps, and smoothed places there (N, 3) [m], continued at both ends."""
-    steps = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1)
-    moved = np.concatenate([[True], steps > 1e-4])
-    way = np.concatenate([[0.0], np.cumsum(steps)])[moved]
+    way = _driven(positions[:, :2])
+    moved = np.diff(way, prepend=-1.0) > 1e-4
+    way = way[moved]
     even = np.arange(0.0, way[-1], STEP)
-    course = np.stack([np.interp(even, way, x) for x in positions[moved].T], axis=1)
-    course = gaussian_filter1d(course, _SMOOTHED / STEP, axis=0, mode="nearest")
+    course = gaussian_filter1d(interpolated(even, way, positions[moved]), _SMOOTHED / STEP, axis=0, mode="nearest")
     beyond = np.arange(STEP, _BEYOND, STEP)
     span, ends = min(round(4 / STEP), len(course) - 1), []
     for start, inner in ((0, span), (-1, -1 - span)):
@@ -162,10 +171,8 @@ def _way() -> Array:
     straight = (ahead[1:] * ahead[:-1]).sum(axis=1) > 0.9
     middle = np.where(straight[:, None], right[1:], right[1:] + right[:-1])
     corners += np.concatenate([right[:1], middle, right[-1:]])
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    length = _driven(corners)
     fine = np.arange(0.0, length[-1], _STEP)
-    polygon = np.stack([np.interp(fine, length, x) for x in corners.T], axis=1)
-    smooth = gaussian_filter1d(polygon, _ROUND / _STEP, axis=0, mode="nearest")
-    run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
-    even = np.arange(2 * _ROUND, run[-1] - 2 * _ROUND, _STEP)
-    return np.stack([np.interp(even, run, x) for x in smooth.T], axis=1)
+    smooth = gaussian_filter1d(interpolated(fine, length, corners), _ROUND / _STEP, axis=0, mode="nearest")
+    run = _driven(smooth)
+    return interpolated(np.arange(2 * _ROUND, run[-1] - 2 * _ROUND, _STEP), run, smooth)

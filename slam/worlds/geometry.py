@@ -175,11 +175,11 @@ def turned(vectors: Array, bodies: IdArray, T_world_body: Array) -> Array:
 
 def hidden(centre: Array, points: Array, occluders: RectangleArrays) -> BoolArray:
     """Which points (P, 3) an occluder's front hides from a camera at `centre` (3,), all in world coordinates."""
-    rays = points - centre
-    rows = _between(centre, rays, occluders)
-    if not len(rows):
-        return np.zeros(len(points), bool)
-    chosen = occluders.select(rows)
+    rays, may = points - centre, (occluders.normal * (occluders.origin - centre)).sum(axis=1) < -1e-9
+    ahead = rays.sum(axis=0)
+    if (rays @ ahead > 0).all():  # then what is wholly behind hides nothing
+        may &= (occluders.middle - centre) @ ahead >= -occluders.radius * np.linalg.norm(ahead)
+    chosen = occluders.select(np.flatnonzero(may))
     offset = chosen.origin - centre
     along, down = (edge / (edge**2).sum(axis=1, keepdims=True) for edge in (chosen.along, chosen.down))
     height = (chosen.normal * offset).sum(axis=1)
@@ -189,24 +189,6 @@ def hidden(centre: Array, points: Array, occluders: RectangleArrays) -> BoolArra
         v = t * (rays @ down.T) - (offset * down).sum(axis=1)
         inside = (np.abs(u - 0.5) < 0.5) & (np.abs(v - 0.5) < 0.5)
         return (inside & (np.abs(t - 0.5) < 0.499)).any(axis=1)
-
-
-def _between(centre: Array, rays: Array, occluders: RectangleArrays) -> np.ndarray:
-    """Rows of occluders that face the camera and may lie between it and a point: their spheres meet the rays' cone."""
-    if not len(rays):
-        return np.zeros(0, int)
-    offset = occluders.middle - centre
-    distance = np.linalg.norm(offset, axis=1) + 1e-12
-    length = np.linalg.norm(rays, axis=1)
-    directions = rays / length[:, None]
-    axis = directions.mean(axis=0)
-    axis /= np.linalg.norm(axis)
-    widest = np.arccos(np.clip((directions @ axis).min(), -1, 1))
-    angle = np.arccos(np.clip((offset @ axis) / distance, -1, 1))
-    angle -= np.arcsin(np.minimum(occluders.radius / distance, 1.0))
-    facing = (occluders.normal * offset).sum(axis=1) < -1e-9
-    near = distance - occluders.radius < length.max()
-    return np.flatnonzero(facing & near & ((angle < widest) | (distance < occluders.radius)))
 
 
 @dataclass(frozen=True, eq=False)

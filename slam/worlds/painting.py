@@ -17,15 +17,6 @@ _INKS = ((25, 30, 40), (235, 240, 240), (40, 40, 170), (150, 70, 30))
 _DARK = (30.0, 30.0, 40.0)
 
 
-def _even(colour: Colour, *spots: tuple[float, float, int]) -> Callable[[Size, Rng, float], np.ndarray]:
-    """A painter of a surface with nothing on it, see `slam.worlds.brushes.mottled`."""
-    return lambda size, rng, density: mottled(size, rng, density, colour, *spots)
-
-
-_BOARD = _even((205.0, 212.0, 215.0), (0.01, 0.2, 3))
-_PLASTER = _even((200.0, 212.0, 218.0), (0.012, 0.6, 3), (0.006, 0.01, 2))  # nearly nothing to see
-
-
 def paint(texture: Texture, density: float) -> np.ndarray:
     """The picture of a texture, BGR uint8 (round(height · density), round(width · density), 3), texels per metre.
 
@@ -71,7 +62,7 @@ def _cover(size: Size, rng: Rng, density: float) -> np.ndarray:
 
 def _poster(size: Size, rng: Rng, density: float) -> np.ndarray:
     ground = rng.uniform(120, 240, 3)
-    page = Page(mottled(size, rng, density, ground, (0.02, 0.1, 3)), rng)
+    page = Page(mottled(size, rng, density, ground, [(0.02, 0.1, 3)]), rng)
     page.title(7, page.part(0.08, 0.04, 0.84, 0.14), _DARK)
     for _ in range(9):
         x, y = rng.uniform(0.15, 0.85) * page.width, rng.uniform(0.27, 0.6) * page.height
@@ -86,7 +77,7 @@ def _poster(size: Size, rng: Rng, density: float) -> np.ndarray:
 
 
 def _ceiling(size: Size, rng: Rng, density: float) -> np.ndarray:
-    page = Page(mottled(size, rng, density, (205.0, 210.0, 212.0), (0.01, 0.05, 3)), rng)
+    page = Page(mottled(size, rng, density, (205.0, 210.0, 212.0), [(0.01, 0.05, 3)]), rng)
     step, joint = 0.6 * density, 0.012 * density
     for x in np.arange(0, page.width, step):
         page.bar((x - joint / 2, 0, joint, page.height), (150.0, 155.0, 158.0))
@@ -239,9 +230,13 @@ class Recipe(NamedTuple):
     detail: float = 1.0  # how finely, as a share of the texels asked for: plain surfaces need fewer
 
 
+_PLASTER = partial(mottled, colour=(200.0, 212.0, 218.0), spots=[(0.012, 0.6, 3), (0.006, 0.01, 2)])  # hardly anything
+_CARPET = partial(mottled, colour=(105.0, 85.0, 75.0), spots=[(0.10, 0.008, 2), (0.05, 0.15, 3)])
+_BOARD = partial(mottled, colour=(205.0, 212.0, 215.0), spots=[(0.01, 0.2, 3)])
+
 RECIPES = {
     "plaster": Recipe(_PLASTER, _fleck, 0.25),
-    "carpet": Recipe(_even((105.0, 85.0, 75.0), (0.10, 0.008, 2), (0.05, 0.15, 3)), _fleck, 0.5),
+    "carpet": Recipe(_CARPET, _fleck, 0.5),
     "ceiling": Recipe(_ceiling, None, 0.5),
     "carton": Recipe(_carton, _print),
     "board": Recipe(_BOARD, _print),

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from slam.worlds import indoors, streets, traffic
 from slam.worlds.geometry import Parts, place_landmarks
 from slam.worlds.options import Option
 from slam.worlds.paths import CAMERAS
-from slam.worlds.world import World
+from slam.worlds.world import Scene, World
 
 _TOE_IN = 0.06  # each camera of the toed-in rig turns this far inwards [rad]
 #: Focal length [px] and the image width that it is meant for, by kind of motion; that of driving is KITTI's.
@@ -25,20 +24,6 @@ _TOWN = {
     **_DRIVING, "density": 1.2, "detect": 0.75, "change": 0.5, "clutter": 0.3,
     "descriptor": 16, "descriptor_noise": 0.1, "descriptor_drift": 2.2,
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A built-in world."""
-
-    text: str  # what it is, in a line
-    build: Callable[[Mapping[str, Any]], Parts]  # makes its parts from the values of its options
-    reach: tuple[float, float]  # nearest and farthest distance of a feature [m]
-    texels: float  # per metre of a surface
-    kind: str = "handheld"  # of motion, or ``"driving"``
-    options: tuple[Option, ...] = ()  # that it has alone
-    defaults: Mapping[str, Any] = field(default_factory=dict)  # of common options, where they are others than usual
-    alike: bool = False  # see `slam.worlds.geometry.place_landmarks`
 
 
 def _camera(default: str) -> tuple[Option, ...]:

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from slam.data import IdArray
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.worlds.drives import EYE, SAME_ROAD, STEP, Road, around_blocks, level, read_path, sampled
+from slam.worlds.drives import EYE, SAME_ROAD, STEP, Road, around_blocks, interpolated, level, read_path, sampled
 from slam.worlds.geometry import DOWN, Parts, Rectangle, crate, cuboid, rectangle
 from slam.worlds.paths import placed
 from slam.worlds.surfaces import Facade, Material
@@ -149,7 +149,7 @@ class Streets:
         way = self._road.way[run]
         edge = self._road.xy[run] + side * ASIDE * self._road.left[run]
         for a, b, part in self._pieces(way[0], way[-1], side):
-            ends = np.array([[np.interp(w, way, x) for x in edge.T] for w in (a, b)])
+            ends = interpolated(np.array([a, b]), way, edge)
             before = run[(way >= a) & (way <= b)]
             if not len(before):
                 continue

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from slam.geometry.se3 import Array
-from slam.worlds.drives import EYE, PACE, STEP, Road
+from slam.worlds.drives import EYE, PACE, STEP, Road, interpolated
 from slam.worlds.geometry import Parts, Rectangle, crate
 from slam.worlds.paths import camera_poses, clock, placed, smooth_step, sway
 from slam.worlds.streets import Streets, car
@@ -55,9 +55,8 @@ def path(s: Array, across: Array | float = 0.0) -> tuple[Array, Array]:
     yaw = _heading(grid)
     xy = step * np.cumsum(np.stack([-np.sin(yaw), np.cos(yaw)], axis=1), axis=0)
     xy -= xy[np.searchsorted(grid, 0.0)]
-    place = np.stack([np.interp(s, grid, xy[:, 0]), np.interp(s, grid, xy[:, 1])], axis=1)
     left = np.stack([-np.cos(heading), -np.sin(heading)], axis=1)
-    return place + np.reshape(across, (-1, 1)) * left, heading
+    return interpolated(s, grid, xy) + np.reshape(across, (-1, 1)) * left, heading
 
 
 def surroundings(layout: int) -> list[Rectangle]:

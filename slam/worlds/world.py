@@ -1,7 +1,8 @@
-"""One description of a world, from which observations and images are made."""
+"""What describes a world, and the one form of it from which observations and images are made."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -11,7 +12,22 @@ import numpy as np
 from slam.data import IdArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.worlds.geometry import Landmarks, Rectangle, RectangleArrays
+from slam.worlds.geometry import Landmarks, Parts, Rectangle, RectangleArrays
+from slam.worlds.options import Option
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A world as it is described: built in, or one's own."""
+
+    text: str  # what it is, in a line
+    build: Callable[[Mapping[str, Any]], Parts]  # makes its parts from the values of its options
+    reach: tuple[float, float]  # nearest and farthest distance of a feature [m]
+    texels: float  # per metre of a surface
+    kind: str = "handheld"  # of motion, or ``"driving"``
+    options: tuple[Option, ...] = ()  # that it has alone
+    defaults: Mapping[str, Any] = field(default_factory=dict)  # of common options, where they are others than usual
+    alike: bool = False  # see `slam.worlds.geometry.place_landmarks`
 
 
 @dataclass(frozen=True, eq=False)

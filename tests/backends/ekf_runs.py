@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from backends.ekf import EkfBackend
-from backends.ekf.covariance import CAMERA, Covariance
+from backends.ekf.covariance import CAMERA, HEAD, Covariance
 from slam.data import Observations
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
@@ -29,9 +29,9 @@ def nees(backend: EkfBackend, truth: np.ndarray) -> float:
 
 
 def dense(covariance: Covariance) -> np.ndarray:
-    """Of camera and landmarks of the state, as one matrix (12 + 3A, 12 + 3A)."""
-    kept = np.s_[CAMERA : covariance.begin]
-    return np.delete(np.delete(covariance.P, kept, 0), kept, 1)
+    """Of camera and landmarks, as one matrix (12 + 3N, 12 + 3N)."""
+    rows = np.r_[:CAMERA, HEAD : len(covariance.P)]
+    return covariance.P[rows[:, None], rows]
 
 
 def halfway(data: Scene, frames: int, models: EstimatorModels = MODELS, **options) -> tuple[EkfBackend, set[int]]:

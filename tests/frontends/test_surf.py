@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from frontends.surf import Surf
-from slam.errors import SequenceError
 from tests.frontends.scenes import photograph, texture, warped, zoom_about
 
 VALUES = texture(240, 320)
@@ -96,20 +95,6 @@ def test_a_blob_is_found_where_it_is():
         assert keypoints.laplacian[0] == sign
         localised = Surf(500).localise(photograph(blob), keypoints)
         np.testing.assert_allclose(localised.uv[0], (80.3, 60.6), atol=0.03)
-
-
-def test_mask():
-    mask = np.zeros(IMAGE.shape, np.uint8)
-    mask[:, :160] = 255
-    everywhere, left = Surf(100).detect(IMAGE), Surf(100).detect(IMAGE, mask)
-    assert 0 < len(left) < len(everywhere)
-    # At least half of the filter lies on the mask, so the centre does, to the rounding of half a pixel.
-    assert left.uv[:, 0].max() < 160.5
-    assert (everywhere.uv[:, 0] < 159).sum() <= len(left)
-    assert len(Surf(100).detect(IMAGE, np.zeros(IMAGE.shape, bool))) == 0
-    assert same_features(Surf(100).detect(IMAGE, np.ones(IMAGE.shape, bool)), everywhere)
-    with pytest.raises(SequenceError, match="mask: shape"):
-        Surf().detect(IMAGE, np.ones((3, 3)))
 
 
 def nearest_pairs(a, b, A, reach):

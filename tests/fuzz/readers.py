@@ -15,18 +15,11 @@ from tests import bags, recordings
 from tests.fuzz.harness import Broken, Subject
 from tests.fuzz.mutations import NUMBERS, PATHS, Files, choose, mutate
 
-_OXTS = "49.0 8.4 112.8 0.02 0.01 -1.2 1 1 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 4 9 4 4 0\n"
-
 
 def raw(folder: Path) -> Path:
     """A drive of KITTI raw, with OXTS records too."""
     drive = recordings.write_raw(folder / "day")
-    for name in ("velo_to_cam", "imu_to_velo"):
-        (drive.parent / f"calib_{name}.txt").write_text("R: 1 0 0 0 1 0 0 0 1\nT: 0.1 0.2 0.3\n")
-    (drive / "oxts" / "data").mkdir(parents=True)
-    (drive / "oxts" / "timestamps.txt").write_text((drive / "image_00" / "timestamps.txt").read_text())
-    for k in range(6):
-        (drive / "oxts" / "data" / f"{k:010d}.txt").write_text(_OXTS.replace("8.4", f"8.400{k}"))
+    recordings.write_oxts(drive, [f"49.0 8.400{k} 112.8 0.02 0.01 -1.2" for k in range(6)])
     return drive
 
 

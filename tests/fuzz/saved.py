@@ -16,7 +16,7 @@ import numpy as np
 from slam.atlas.map_io import decode, encode
 from slam.calibration.saved import SavedCalibration, load_calibration
 from slam.config import SystemConfig
-from slam.geometry.rig_numbers import rig_numbers
+from slam.geometry.rig import rig_numbers
 from slam.run.options import RunOptions
 from slam.run.recording import RecordedFrame, Recording, load_recording, save_recording
 from slam.run.run_data import RunData

@@ -21,15 +21,8 @@ def jacobian(function: Callable, x: np.ndarray, step: float = 1e-6) -> np.ndarra
 def assert_equal_to_rounding(found: np.ndarray, expected: np.ndarray, steps: int = 1) -> None:
     """The same matrix, but for the order in which sums were made: it depends on the processor's BLAS kernels.
 
-    The rounding error of an entry, a sum of products, is relative to the products and not to what they leave when they
-    cancel: so the bound is relative to the largest entry. A product of three matrices of a hundred rows has some two
-    hundred terms an entry, each rounded to 1.1e-16, in products up to ten times the largest entry: 2e-13, bounded by
-    1e-12.
-
-    Args:
-        found: what was computed.
-        expected: the same by another formula.
-        steps: how many such products follow on each other.
+    A product of three matrices of a hundred rows has some two hundred terms an entry, each rounded to 1.1e-16, in
+    products up to ten times the largest entry: 2e-13 of that, bounded by 1e-12 for each of so many products (`steps`).
     """
     expected = np.asarray(expected)
     np.testing.assert_allclose(found, expected, rtol=0, atol=steps * 1e-12 * np.abs(expected).max(initial=0.0))

@@ -65,15 +65,7 @@ def test_two_outputs_are_not_the_same(tmp_path):
     (tmp_path / "link").symlink_to("out")
     out, words = folder(tmp_path / "out"), "cannot write to the same place"
     for path in ("out/a.txt", "link/a.txt", "out/000000.png", "out/./a.txt"):
-        refused(
-            [
-                out,
-                file(
-                    tmp_path / path,
-                ),
-            ],
-            words,
-        )
+        refused([out, file(tmp_path / path)], words)
     for path in ("out", "link"):
         refused([out, folder(tmp_path / path, option="--draw")], words)
     refused([file(tmp_path / "x"), file(tmp_path / "./x", "--record")], words)

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from slam import registry
-from slam.errors import ConfigurationError, UnknownNameError
-from slam.geometry.rig import StereoRig
+from slam.errors import UnknownNameError
 
 ROOT = Path(__file__).resolve().parents[2]
 _RESOLVE = "from slam import registry; registry.resolve({role!r}, {name!r})"
@@ -56,19 +55,7 @@ def test_a_back_end_by_its_module_in_the_working_folder(tmp_path, monkeypatch):
     for name in ("my_own_module:Other", "my_own_module:", ":Mine", "a_broken_module:Mine"):
         with pytest.raises(UnknownNameError, match=f"back end '{name}' cannot be loaded"):
             registry.resolve("backends", name)
+    with pytest.raises(UnknownNameError, match=r"no attribute 'mine' \(did you mean 'Mine'\?\)"):
+        registry.resolve("backends", "my_own_module:mine")
     with pytest.raises(UnknownNameError, match=f"looked for in {tmp_path}, where `slam` runs"):
         registry.resolve("backends", "no_module_of_this_name:Mine")
-
-
-def test_an_unknown_option_of_a_subclass_is_named_with_all_of_its_own(tmp_path, monkeypatch):
-    (tmp_path / "my_subclass.py").write_text(
-        "from backends.ekf import EkfBackend\n"
-        "class Near(EkfBackend):\n"
-        "    def __init__(self, rig, models=None, least=2.0, **options):\n"
-        "        super().__init__(rig, **({} if models is None else {'models': models}), **options)\n"
-    )
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
-    with pytest.raises(ConfigurationError, match=r"'leest' \(did you mean 'least'\?\); known: least, "):
-        registry.create("backends", "my_subclass:Near", rig, leest=3.0)

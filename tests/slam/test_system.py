@@ -48,18 +48,6 @@ def test_tracks_a_cloud(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_frames_with_nothing_to_see_are_predicted(backend):
-    system, results, truth = run(backend, change=nothing_at(15, 16, 17))
-    statuses = [r.status for r, _ in results]
-    assert [k for k, s in enumerate(statuses) if s is FrameStatus.PREDICTED] == [15, 16, 17]
-    assert all(r.reason for r, _ in results[15:18])
-    # the limit of the run without dark frames; the claimed sigma is 9 to 11 mm
-    assert np.linalg.norm(system.trajectory().positions[-1] - truth[-1, :3, 3]) < 0.012
-    grown = [np.trace(r.estimate.covariance) for r, _ in results[14:18]]
-    assert grown == sorted(grown)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_new_map_forgets_what_the_rig_s_error_does_to_the_landmarks_of_the_old_one(backend):
     """By a baseline 33 times too long nothing is tracked, and map follows map, while the calibration goes on."""
     sequence = slam.open_sequence("synthetic:desk?frames=12&baseline=0.075")

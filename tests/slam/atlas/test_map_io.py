@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-import zipfile
 from dataclasses import fields, replace
-from io import BytesIO
 
 import numpy as np
 import pytest
@@ -15,7 +12,7 @@ from slam.atlas.map_io import SavedMap, decode, encode, load_map, map_arrays, ma
 from slam.checks import definite, require_known
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
-from slam.errors import ConfigurationError, MeasurementError, SlamError
+from slam.errors import MeasurementError, SlamError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp
@@ -48,19 +45,6 @@ def first_run(backend, frames=25, cloud=None):
 # --- the file ---
 
 
-def test_everything_comes_back(tmp_path):
-    before = some_map()
-    save_map(tmp_path / "a.map", before)
-    after = load_map(tmp_path / "a.map")
-    for name in ("ids", "positions", "covariances", "descriptors", "laplacian", "seen", "in_view"):
-        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
-        assert getattr(after, name).dtype == getattr(before, name).dtype
-    assert (after.frontend, after.world_frame, after.written_by) == ("surf", "somewhere", "a test")
-    assert after.source == str(tmp_path / "a.map")
-    assert encode(after) == (tmp_path / "a.map").read_bytes()  # byte for byte
-    assert [f.name for f in tmp_path.iterdir()] == ["a.map"]  # nothing temporary is left
-
-
 def test_any_altered_byte_is_found():
     data = encode(some_map())
     rng = np.random.default_rng(0)
@@ -71,53 +55,12 @@ def test_any_altered_byte_is_found():
         with pytest.raises(SlamError, match=r"a\.map") as error:
             decode(bytes(altered), "a.map")
         assert "\n" not in str(error.value)
+    old = data.replace(b"map 7\n", b"map 6\n", 1)
+    with pytest.raises(SlamError, match=r"version '6'.*version 7"):
+        decode(old, "a.map")
     for other in (*(data[:n] for n in (0, 5, 22, 60, 90, 500, len(data) - 1)), data + b"\0"):
         with pytest.raises(SlamError, match=r"a\.map"):
             decode(other, "a.map")
-
-
-def signed(body: bytes) -> bytes:
-    return b"surf-stereo-slam map 7\n" + hashlib.sha256(body).hexdigest().encode() + b"\n" + body
-
-
-def with_member(name: str, content: bytes | None) -> bytes:
-    """A map with one member of its archive exchanged or left out, and the right checksum."""
-    out = BytesIO()
-    body = encode(some_map()).split(b"\n", 2)[2]
-    with zipfile.ZipFile(BytesIO(body)) as old, zipfile.ZipFile(out, "w") as new:
-        for info in old.infolist():
-            if info.filename != name:
-                new.writestr(info, old.read(info))
-            elif content is not None:
-                new.writestr(info, content)
-    return signed(out.getvalue())
-
-
-def npy(array, allow_pickle=False):
-    buffer = BytesIO()
-    np.lib.format.write_array(buffer, np.asarray(array), allow_pickle=allow_pickle)
-    return buffer.getvalue()
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("ids.npy", None),
-        ("header.json", b"{}"),
-        ("ids.npy", npy(np.arange(20)[::-1])),
-        ("ids.npy", npy(np.arange(19))),
-        ("covariances.npy", npy(np.zeros((20, 3, 3)))),
-        ("descriptors.npy", npy(np.full((20, 4), np.inf, np.float32))),
-        ("seen.npy", npy(np.array([{}] * 20, object), allow_pickle=True)),
-        ("positions.npy", npy(np.full((20, 3), 1e300))),
-        ("covariances.npy", npy(np.tile(1e300 * np.eye(3), (20, 1, 1)))),
-        ("seen.npy", b""),
-    ],
-)
-def test_a_map_that_is_none_is_refused_though_its_checksum_is_right(name, content):
-    with pytest.raises(SlamError, match=r"a\.map") as error:
-        decode(with_member(name, content), "a.map")
-    assert "\n" not in str(error.value)
 
 
 def test_a_landmark_that_is_hardly_known_can_be_kept():
@@ -128,20 +71,6 @@ def test_a_landmark_that_is_hardly_known_can_be_kept():
         require_known("a map", np.arange(2), np.ones((2, 3)), P)
     require_known("a map", np.arange(2), np.ones((2, 3)), definite(P))
     np.testing.assert_array_equal(definite(P)[1], P[1])
-
-
-def test_other_files_and_versions_are_refused(tmp_path):
-    with pytest.raises(SlamError, match="there is no such file"):
-        load_map(tmp_path / "none.map")
-    (tmp_path / "text").write_text("hello")
-    with pytest.raises(SlamError, match="not a saved map"):
-        load_map(tmp_path / "text")
-    for version in (b"2", b"6"):
-        data = encode(some_map()).replace(b"map 7\n", b"map " + version + b"\n", 1)
-        with pytest.raises(SlamError, match=f"version '{version.decode()}'.*version 7"):
-            decode(data, "a.map")
-    with pytest.raises(SlamError, match="cannot be written"):
-        save_map(tmp_path / "text" / "folder.map", some_map())
 
 
 # --- keyframes and loops in it ---
@@ -172,21 +101,21 @@ def saved(keyframes: tuple[Keyframe, ...]) -> SavedMap:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("keyframes", [KEYFRAMES, ()])
-def test_keyframes_and_loops_come_back(keyframes: tuple[Keyframe, ...]):
-    read = decode(encode(saved(keyframes)), "a.map")
-    found = read.keyframes
-    assert len(found) == len(keyframes)
-    np.testing.assert_array_equal(read.keyframe_poses, POSES[: len(keyframes)])
-    for one, other in zip(keyframes, found):
-        assert other.correction is None
-        for field in fields(Keyframe)[:-1]:
-            np.testing.assert_allclose(getattr(one, field.name), getattr(other, field.name), atol=1e-12)
-    assert len(read.loops) == (2 if keyframes else 0)
-    for loop, again in zip(LOOPS, read.loops):
-        for field in fields(Loop):
-            np.testing.assert_array_equal(getattr(loop, field.name), getattr(again, field.name))
-    assert encode(saved(found)) == encode(saved(keyframes))
+@pytest.mark.parametrize("before", [some_map(), saved(KEYFRAMES), saved(())])
+def test_everything_comes_back(before: SavedMap, tmp_path):
+    save_map(tmp_path / "a.map", before)
+    after = load_map(tmp_path / "a.map")
+    assert encode(after) == (tmp_path / "a.map").read_bytes()  # byte for byte
+    assert [f.name for f in tmp_path.iterdir()] == ["a.map"]  # nothing temporary is left
+    assert after.source == str(tmp_path / "a.map") and all(k.correction is None for k in after.keyframes)
+    pairs = [(before, after), *zip(before.keyframes, after.keyframes, strict=True), *zip(before.loops, after.loops)]
+    for one, other in pairs:
+        for field in fields(one):
+            if field.name not in ("source", "keyframes", "loops", "correction"):
+                value = getattr(other, field.name)
+                np.testing.assert_array_equal(value, getattr(one, field.name))
+                assert np.asarray(value).dtype == np.asarray(getattr(one, field.name)).dtype
+    assert len(after.loops) == len(before.loops)
 
 
 def test_new_landmarks_get_ids_that_no_keyframe_has():
@@ -195,6 +124,10 @@ def test_new_landmarks_get_ids_that_no_keyframe_has():
 
 
 @pytest.mark.parametrize(("name", "value"), [
+    ("ids", np.zeros(2, np.int64)),
+    ("positions", np.full((1, 3), 1e300)),
+    ("covariances", np.zeros((1, 3, 3))),
+    ("descriptors", np.full((1, 16), np.inf, np.float32)),
     ("keyframe_stamps", np.zeros(3)),
     ("keyframe_poses", np.tile(2 * np.eye(4), (4, 1, 1))),
     ("keyframe_covariances", np.tile(-np.eye(6), (4, 1, 1))),
@@ -256,13 +189,8 @@ def test_descriptors_of_another_kind_are_refused():
     features, _ = Cloud(60, dimensions=64).features(np.eye(4), 1.0)
     with pytest.raises(SlamError, match="descriptors have 64 numbers, those of earlier frames 32"):
         system.process_features(features)
-    assert system.process_features(StereoFeatures.empty(2.0, 32)).status is FrameStatus.LOST
-    with pytest.raises(MeasurementError, match="not later"):
-        system.process_features(StereoFeatures.empty(1.5, 32))
     with pytest.raises(SlamError, match="front end 'orb'"):
         StereoSlam(RIG, "surf", "ekf", prior_map=replace(known, frontend="orb"))
-    with pytest.raises(ConfigurationError, match="by name"):
-        StereoSlam(RIG, None, StereoSlam(RIG, None, "ekf").backend, prior_map=known)
 
 
 @pytest.mark.parametrize(
@@ -291,14 +219,3 @@ def test_a_prior_map_that_is_larger_than_the_limit_is_kept():
     small = replace(CONFIG, map=replace(CONFIG.map, target_in_view=10, max_landmarks=10))
     system = StereoSlam(RIG, None, "ekf", config=small, prior_map=known)
     assert system.config.map.max_landmarks == len(known) > 10
-
-
-def test_there_is_no_map_before_the_first_frame_and_an_empty_one_is_refused():
-    none = np.zeros(0, np.int64)
-    empty = SavedMap(
-        none, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 32), np.float32), none.astype(np.int8), none, none
-    )
-    with pytest.raises(SlamError, match="holds no landmarks"):
-        StereoSlam(RIG, None, "ekf", config=CONFIG, prior_map=empty)
-    with pytest.raises(SlamError, match="no map yet"):
-        StereoSlam(RIG, None, "ekf").snapshot()

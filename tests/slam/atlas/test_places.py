@@ -7,29 +7,6 @@ import numpy as np
 from slam.atlas.places import PlaceIndex
 
 
-def places(count: int, seed: int = 0) -> np.ndarray:
-    """Descriptors (count, 200, 16) of unit length."""
-    found = np.random.default_rng(seed).normal(size=(count, 200, 16)).astype(np.float32)
-    return found / np.linalg.norm(found, axis=2, keepdims=True)
-
-
-def noisy(descriptors: np.ndarray, seed: int) -> np.ndarray:
-    """Half of a place's descriptors as seen again, and as many others."""
-    rng = np.random.default_rng(seed)
-    seen = descriptors[::2] + 0.05 * rng.normal(size=descriptors[::2].shape)
-    both = np.concatenate([seen, rng.normal(size=(100, 16))]).astype(np.float32)
-    return both / np.linalg.norm(both, axis=1, keepdims=True)
-
-
-def test_finds_the_place():
-    every, index = places(100), PlaceIndex()
-    for some in every:
-        index = index.with_new(some)
-    assert index.count == 100
-    right = [int(np.argmax(index.similarity(noisy(some, k)))) == k for k, some in enumerate(every)]
-    assert np.mean(right) > 0.95
-
-
 def similar_places(count: int) -> np.ndarray:
     """Places (count, 200, 16) like shelves of books: all show the same few kinds of features, in other variations."""
     rng = np.random.default_rng(5)

@@ -30,7 +30,7 @@ class Street:
         d = rng.standard_normal((count, 32))
         self.descriptors = (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32)
 
-    def features(self, stamp, T_world_left, parameters=None, noise=0.15, outliers=0.0, most=400, residual=None):
+    def features(self, stamp, T_world_left, parameters=None, noise=0.15, most=400, residual=None):
         """What a rig sees, rectified, that `parameters` (n,) would make ideal; `residual` fields (m,) come on top."""
         rng, rig, model = self.rng, self.rig, self.model
         local = self.scale * se3.transform(se3.inverse(T_world_left), self.points)
@@ -51,9 +51,6 @@ class Street:
         left, right = z[:, :2], np.column_stack([z[:, 2], z[:, 1] + vertical])
         left = left + noise * rng.standard_normal((n, 2))
         right = right + noise * rng.standard_normal((n, 2))
-        wrong = rng.random(n) < outliers
-        right[wrong] += rng.normal(0, 3, (wrong.sum(), 2))
-        left[wrong] += rng.normal(0, 5, (wrong.sum(), 2))
         ones = np.ones(n)
         return StereoFeatures(stamp, left, right, ones, ones, ones, np.ones(n, np.int8), self.descriptors[ids])
 

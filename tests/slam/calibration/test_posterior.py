@@ -20,8 +20,8 @@ from tests.slam.calibration.drives import CAR, parameters, residual_fields
 NONE = np.zeros(1)
 
 
-def evidence(value, sigma, cross=0.0):
-    return Evidence(np.array([[sigma**-2]]), np.array([value / sigma**2]), np.array([[cross]]))
+def evidence(value, sigma):
+    return Evidence(np.array([[sigma**-2]]), np.array([value / sigma**2]), np.zeros((1, 1)))
 
 
 def test_the_posterior_is_that_of_the_whole_mixture():

@@ -70,7 +70,6 @@ def test_it_is_the_prior_of_a_run(made, tmp_path):
     [
         (["run", WORLD, "--calibration", "none.json"], r"none\.json"),
         (["run", "synthetic:aisle?frames=3&width=200", "--calibration", "{rig}"], "of another rig: width"),
-        (["run", WORLD, "--calibration", "{rig}", "--set", "self_calibration.enabled=false"], "enabled"),
         (["calibrate", WORLD, "synthetic:aisle?frames=3&baseline=0.2"], "not the rig of"),
         (["calibrate", WORLD, "--set", "self_calibration.enabled=false"], "enabled"),
         (["calibrate", "synthetic:desk?frames=1"], "no recording"),

@@ -42,12 +42,20 @@ def test_a_folder_that_is_missing_or_empty(slam_command, tmp_path):
         fails_with_one_line(slam_command(command, "", "--out", tmp_path / "out"), "path is empty")
 
 
+def test_a_recording_is_no_place_for_a_run_and_no_trial_is_no_comparison(slam_command, euroc, tmp_path):
+    before = sorted(euroc.rglob("*"))
+    for words in (["run", "synthetic:desk?frames=1"], ["compare", "synthetic:desk?frames=1"], ["demo"]):
+        fails_with_one_line(slam_command(*words, "--out", euroc, "--overwrite"), "holds a recording (format euroc)")
+    assert sorted(euroc.rglob("*")) == before
+    none = slam_command("compare", "synthetic:desk", "--trials", 0, "--out", tmp_path / "out")
+    fails_with_one_line(none, "trials must be 1 or more")
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["--backend", "foo"], ["foo", "ekf", "smoother"]),
         (["--set", "backend.colour=1"], ["colour"]),
-        (["--kind", "flying"], ["flying", "handheld"]),
         (["--frames", "40"], ["A:B; 0:40 are the first 40"]),
         (["--frames", "7:9"], ["7:9"]),
     ],

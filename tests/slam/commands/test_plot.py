@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from slam.config import SystemConfig
-from slam.errors import SlamError
-from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.geometry.trajectory import TruthNoise
 from slam.run.options import RunOptions
-from slam.run.plots import drawn
 from slam.run.plots import plot_folders as plot_runs
 from slam.run.run_data import RunData, pose_errors
 from slam.run.runner import run
@@ -19,12 +17,11 @@ WORLD = "synthetic:aisle?frames=8&width=160&height=120"
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory):
-    """Folders of two runs of one world by two back ends."""
-    root, config = tmp_path_factory.mktemp("runs"), SystemConfig.for_kind("handheld")
-    for name, backend in (("a", "ekf"), ("b", "smoother")):
-        run(open_sequence(WORLD), RunOptions(backend, "surf", config, root / name))
-    return root
+def finished(tmp_path_factory):
+    """What a run has left."""
+    folder, config = tmp_path_factory.mktemp("run"), SystemConfig.for_kind("handheld")
+    run(open_sequence(WORLD), RunOptions("ekf", "surf", config, folder))
+    return RunData.read(folder, "a")
 
 
 def test_a_path_that_is_one_dot_is_drawn_without_a_word(tmp_path, caplog):
@@ -35,43 +32,21 @@ def test_a_path_that_is_one_dot_is_drawn_without_a_word(tmp_path, caplog):
     assert not caplog.messages
 
 
-def test_the_folder_above_finished_runs_names_them(runs):
-    with pytest.raises(SlamError, match=f"below it are some: {runs / 'a'} {runs / 'b'}"):
-        plot_runs([runs], None, "summary")
-
-
-def test_runs_with_different_true_paths_and_a_lost_one_say_so(runs):
-    first, second = (RunData.read(runs / name, name) for name in "ab")
-    other = replace(second, truth=Trajectory(second.truth.stamps, 2.0 * second.truth.poses))
-    for pair, words in (((first, second), "true path"), ((first, other), "true path of a; others have another")):
-        assert words in [line.get_label() for line in drawn(pair, "path").axes[0].lines]
-    lost = replace(first, measured=np.arange(len(first.measured)) == 0)
-    assert drawn([lost], "path").axes[0].get_title().startswith("No path")
-    stands = replace(first, truth=None, **dict.fromkeys(("online", "final"), still(first.online)))
-    assert drawn([stands], "path").axes[0].get_title().startswith("The camera stands")
-
-
-def still(path):
-    return Trajectory(path.stamps, np.tile(np.eye(4), (len(path), 1, 1)))
-
-
-def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(runs):
+def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(finished):
     """What the headline says of the covariances counts both."""
-    run_ = RunData.read(runs / "a", "a")
-    _, error, sigma = pose_errors(run_)
-    summary = run_.summary["accuracy"]["online"]
+    _, error, sigma = pose_errors(finished)
+    summary = finished.summary["accuracy"]["online"]
     assert np.sqrt(np.mean(error[:, 1] ** 2)) == pytest.approx(summary["rotation RMSE from start [deg]"], rel=1e-3)
     assert (error[1:, 1] < 5 * sigma[1:, 1]).all() and (sigma[1:, 1] > 0).all()
 
 
-def test_where_the_truth_s_sensor_is_and_its_clock_are_part_of_the_claimed_error_and_its_turn_of_none(runs):
+def test_where_the_truth_s_sensor_is_and_its_clock_are_part_of_the_claimed_error_and_its_turn_of_none(finished):
     """A turn of 1° made σ a metre on a drive of 60 m, beside errors of a centimetre: these are without it."""
-    run_ = RunData.read(runs / "a", "a")
     noises = {"mounting": 0.1}, {"lever": 0.1}, {"clock": 0.1}
-    _, _, exact = pose_errors(run_)
-    turned, moved, late = (pose_errors(replace(run_, truth_noise=TruthNoise(**noise)))[2] for noise in noises)
+    _, _, exact = pose_errors(finished)
+    turned, moved, late = (pose_errors(replace(finished, truth_noise=TruthNoise(**noise)))[2] for noise in noises)
     np.testing.assert_allclose(turned, exact)
     assert (moved[1:, 0] > exact[1:, 0]).all()
-    rates = np.diff(run_.truth.positions, axis=0) / np.diff(run_.truth.stamps)[:, None]
+    rates = np.diff(finished.truth.positions, axis=0) / np.diff(finished.truth.stamps)[:, None]
     expected = 0.1 * np.linalg.norm(rates[-1] - rates[0])
     assert np.sqrt(late[-1, 0] ** 2 - exact[-1, 0] ** 2) == pytest.approx(expected, rel=0.05)

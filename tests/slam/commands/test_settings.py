@@ -46,11 +46,16 @@ def test_a_setting_of_the_program_itself_is_refused():
 OWN = """
 from dataclasses import dataclass
 from backends.ekf import EkfBackend
+from slam.guarded import guarded
 class Near(EkfBackend):
     def __init__(self, rig, models=None, least=2.0, **options):
         super().__init__(rig, **options)
 class Plain:
     def __init__(self, rig, models=None): pass
+@guarded
+class Behind:
+    def __init__(self, rig, models, wobble=3.0): pass
+    predict = update = add = remove = estimate = positions = print
 """
 
 
@@ -64,6 +69,9 @@ def test_options_of_a_class_of_one_s_own_are_listed_and_named_in_errors(tmp_path
     with pytest.raises(ConfigurationError, match="unknown option 'leest'"):
         registry.create("backends", "own_options:Near", RIG, leest=3.0)
     assert "own_options:Plain has no options" in next(listing("own_options:Plain", 80))
+    assert "backend.wobble = 3.0" in "\n".join(listing("own_options:Behind", 80))
+    with pytest.raises(ConfigurationError, match="is none: it lacks trajectory"):
+        registry.create("backends", "own_options:Behind", RIG)
     config = SystemConfig().with_settings({"backend.leest": 3.0})
     with pytest.raises(ConfigurationError, match=r"backend\.leest: an object is made with its options"):
         slam.StereoSlam(RIG, backend=registry.create("backends", "ekf", RIG.rectified.rig), config=config)

@@ -3,10 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from slam.compare.plan import Plan
 from slam.compare.statistics import difference, reach
+from slam.compare.sweep import Run
+from slam.compare.tables import groups, sentences
 from slam.run.results import BY_KEY
 
-ATE, NEES, TRACKED, DOUBTED = (BY_KEY[key] for key in ("ate_online_m", "nees_per_dof", "tracked", "doubted"))
+ATE, NEES, TRACKED, DOUBTED = (BY_KEY[key] for key in ("ate_online_m", "ratio_start", "tracked", "doubted"))
 
 
 def pairs(n):
@@ -54,6 +57,17 @@ def test_failed_runs_are_counted_and_their_pairs_left_out():
     reference[2] = other[5] = np.nan
     d = difference(ATE, reference, other)
     assert (d.pairs, d.missing) == (6, 2)
+
+
+def test_each_figure_that_the_sentence_names_is_in_the_first_table(tmp_path):
+    plan, drifts = Plan(("synthetic:desk",), ("ekf", "window"), trials=6), pairs(6)
+    runs = []
+    for trial in plan.every:
+        own = drifts[trial.backend == "window"][trial.seed]
+        runs.append(Run(trial, "completed", {"ate_online_m": 1.0, "rpe_1s_m": own, "rpe_1s_deg": 1.0}, {}, tmp_path))
+    (group,) = groups(plan, runs)
+    assert sentences(group) == ["window is better than ekf in online drift in 1 s."]
+    assert [metric.key for metric in group.first_metrics] == ["ate_online_m", "rpe_1s_m"]
 
 
 def test_honesty_is_the_distance_from_one():

@@ -61,7 +61,7 @@ def test_every_run_is_there_with_its_figures(done):
     for run in runs:
         assert 0 < run.metrics["ate_online_m"] < 0.05
         assert run.metrics["tracked"] == 1
-        assert {"nees_per_dof", "nis_per_dof", "landmark_error_m", "map_size"} <= set(run.metrics)
+        assert {"ratio_start", "nis_per_dof", "landmark_error_m", "map_size"} <= set(run.metrics)
         assert run.milliseconds["update"] > 0
     closed = [run for run in runs if run.trial.mode == CLOSED_LOOP]
     assert all(run.metrics["association_precision"] > 0.9 for run in closed)

@@ -9,6 +9,7 @@ from slam.compare import trial
 from slam.compare.plan import REPLAY, Plan, Trial
 from slam.compare.sweep import RUNS, is_done
 from slam.compare.trial import COMPLETED, keep_result
+from slam.config import SystemConfig
 from slam.files import read_object
 from slam.sequences import open_sequence
 from slam.worlds.export import write_euroc
@@ -26,6 +27,16 @@ def test_what_was_run_with_other_settings_frames_or_versions_is_not_done(tmp_pat
     other = replace(trial, settings=("frontend.features=900",))
     assert not is_done(replace(plan, replay=True), trial, tmp_path)  # there is no recording to replay
     assert not is_done(plan, other, tmp_path) and not is_done(plan, replace(trial, stop=3), tmp_path)
+
+
+def test_a_trial_has_the_settings_of_its_sequence_s_kind(tmp_path):
+    street = Trial("synthetic:street?frames=3", "ekf", frontend="simulated", settings=("map.max_landmarks=120",))
+    trial.run_trial(street, tmp_path)
+    assert read_object(tmp_path / "result.json")["outcome"] == COMPLETED
+    config, expected = read_object(tmp_path / "config.json"), SystemConfig.for_kind("driving", None)
+    assert config["kind"] == "driving"
+    settings = SystemConfig.from_json(config["settings"])
+    assert settings.objects == expected.objects and settings.map == replace(expected.map, max_landmarks=120)
 
 
 def test_a_run_that_began_again_has_figures_and_its_cause_and_no_recording(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 
 import slam
 from experiments.simulated_recording import true_recording
-from slam.calibration.posterior import RigPosterior
+from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.config import SystemConfig
 from slam.data import FrameStatus
 from slam.errors import MeasurementError, SequenceError
@@ -66,33 +66,21 @@ def require_same_frames(one, other):
             np.testing.assert_array_equal(getattr(a.added, name), getattr(b.added, name))
 
 
-def test_what_was_mended_in_a_run_is_mended_in_its_replay(desk, tmp_path, monkeypatch):
-    offsets = {8: 0.3, 11: 0.2}  # what the self-calibration believes from a frame on [px]
-    system = StereoSlam(desk.rig, None, "smoother")
-    calibration, results = system.calibration, []
-    monkeypatch.setattr(calibration, "observe", lambda *_: None)
-    monkeypatch.setattr(calibration, "_motion_agrees", lambda: True)
-    column = calibration.model.names.index("right_cx")
-    for k in range(FRAMES):
-        if k in offsets:
-            mean, tight = np.zeros(len(calibration.model.names)), 1e-9 * np.eye(len(calibration.model.names))
-            mean[column] = offsets[k] / calibration.model.focal
-            calibration._own = RigPosterior(mean, tight)
-        results.append(system.process_features(desk.observations(k)))
-    revisions = [r.revision for r in results]
-    assert [k for k, r in enumerate(revisions) if r is not None] == [8, 11]
-    save_recording(recorded_of(results, system), tmp_path / "run.npz")
-    recorded = load_recording(tmp_path / "run.npz")
-    backend, given = StereoSlam(desk.rig, None, "smoother").backend, []
-    z = np.array([[200.0, 100.0, 180.0]])
-    monkeypatch.setattr(backend, "revise", lambda mend: given.append((len(backend.trajectory()), mend(z))))
-    again = [r.revision for r in replay(recorded, backend)]
-    assert [k for k, _ in given] == [8, 11]
-    for k, mended in given:
+def test_what_was_corrected_in_a_run_is_corrected_in_its_replay(desk, recording, tmp_path, monkeypatch):
+    model, z = RigModel(desk.rig), np.array([[200.0, 100.0, 180.0]])
+    shift = np.array([float(name == "right_cx") for name in model.names]) / model.focal  # of uR by 1 px
+    before, first, second = (RigCorrection(model, offset * shift) for offset in (0.0, 0.3, 0.2))
+    revisions = {8: Revision(before, first), 11: Revision(first, second)}
+    frames = tuple(replace(frame, revision=revisions.get(k)) for k, frame in enumerate(recording))
+    save_recording(replace(recording, frames=frames), tmp_path / "run.npz")
+    again, backend, given = load_recording(tmp_path / "run.npz"), StereoSlam(desk.rig, None, "smoother").backend, {}
+    monkeypatch.setattr(backend, "revise", lambda mend: given.update({len(backend.trajectory()): mend(z)}))
+    kept = [RecordedFrame.of(result).revision for result in replay(again, backend)]
+    assert [k for k in range(FRAMES) if kept[k] is not None] == list(given) == list(revisions)
+    for k, mended in given.items():
         np.testing.assert_array_equal(mended, revisions[k].rows(z))
-        np.testing.assert_array_equal(again[k].after.parameters, revisions[k].after.parameters)
-    assert given[0][1][0, 2] == pytest.approx(180.3, abs=0.02)
-    assert len(list(replay(recorded, StereoSlam(desk.rig, None, "ekf").backend))) == FRAMES
+    assert given[8][0, 2] == pytest.approx(180.3, abs=0.02) and given[11][0, 2] == pytest.approx(179.9, abs=0.02)
+    assert len(list(replay(again, StereoSlam(desk.rig, None, "ekf").backend))) == FRAMES
 
 
 def test_a_file_holds_it_all(recording, tmp_path):

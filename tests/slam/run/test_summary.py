@@ -61,7 +61,7 @@ def test_frames_that_are_not_tracked_are_counted_and_left_out_of_the_accuracy():
     assert found["ate_online_m"] == found["ate_final_m"] == pytest.approx(alone["ATE RMSE [m]"])
     assert found["ate_online_m"] < 0.05
     honest = consistency(path.select(rows), covariances[rows], SEQUENCE)["mean NEES"]
-    assert found["nees_per_dof"] == pytest.approx(honest / 6)
+    assert found["ratio_start"] == pytest.approx(np.sqrt(honest / 6))
     assert found["tracked"] == pytest.approx(97 / 120)
 
 

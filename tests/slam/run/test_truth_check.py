@@ -60,6 +60,15 @@ def test_a_usual_mistake_of_the_truth_is_named_and_alone(poses, late, words):
     assert said.count("; and ") == (words.startswith("turned by"))
 
 
+def test_what_the_truth_s_own_errors_explain_is_no_mistake_of_it():
+    """Positions by satellites: off by as much as the camera moves in a second, and by little of the way."""
+    rng, t = np.random.default_rng(2), np.arange(0.0, 120.0, 0.1)
+    ahead = pose(so3_exp(0.2 * np.sin(t)[:, None] * np.array([0.0, 1.0, 0.0])), t[:, None] * np.array([0.0, 0.0, 1.0]))
+    noisy = Trajectory(t, pose(ahead[:, :3, :3], ahead[:, :3, 3] + 0.7 * rng.standard_normal((len(t), 3))))
+    assert "rotations do not" in truth_doubt(Trajectory(t, ahead), noisy)
+    assert truth_doubt(Trajectory(t, ahead), noisy, sigma=0.7) == ""
+
+
 def test_a_baseline_that_is_wrong_is_not_the_truths_fault():
     said = truth_doubt(OWN, Trajectory(TRUTH.stamps, scaled(1 / 1.3)))
     assert said.startswith("the estimated path is 1.3 times as long")

@@ -12,7 +12,7 @@ import pytest
 
 import slam
 from slam.errors import CalibrationError, ConfigurationError, SequenceError, SlamError
-from slam.input.features import outside_masks
+from slam.geometry.trajectory import TruthNoise
 from slam.sequences import open_sequence, with_mask
 from slam.worlds import open_world
 from tests import recordings
@@ -215,19 +215,13 @@ def test_cameras_above_each_other_are_turned(two_folders: Path, build: SimpleNam
 
 def test_the_truth_of_cameras_above_each_other_is_the_turned_camera_s(euroc: Path, build: SimpleNamespace) -> None:
     upright = open_sequence(euroc).ground_truth
-    sensor = euroc / "mav0" / "cam1" / "sensor.yaml"
-    build.write_sensor(sensor, 0.0)
-    T = build.T_body_camera.copy()
-    T[:3, 3] += 0.11 * T[:3, 1]  # the right camera stands below the left one
-    text = sensor.read_text()
-    numbers = ", ".join(map(str, build.T_body_camera.ravel()))
-    sensor.write_text(text.replace(numbers, ", ".join(map(str, T.ravel()))))
+    build.write_sensor(euroc / "mav0" / "cam1" / "sensor.yaml", 0.11, axis=1)
     sequence = open_sequence(euroc)
     turn = np.linalg.inv(upright.poses[0]) @ sequence.ground_truth.poses[0]
     assert sequence.rig.turns == 1 and np.allclose(turn[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
 
-def test_features_under_a_mask_are_not_used(tmp_path: Path, two_folders: Path) -> None:
+def test_masks_are_of_both_cameras_or_of_one(tmp_path: Path, two_folders: Path) -> None:
     mask = np.full((240, 320), 255, np.uint8)
     cv2.imwrite(str(tmp_path / "all.png"), mask)
     mask[:, :160] = 0
@@ -239,12 +233,8 @@ def test_features_under_a_mask_are_not_used(tmp_path: Path, two_folders: Path) -
     with pytest.raises(ConfigurationError, match="mask"):
         open_world("desk?frames=3&mask=none.png")
     assert frame.right_mask.all() and not frame.left_mask[:, :160].any() and frame.left_mask[:, 160:].all()
-    rows = np.column_stack([np.linspace(10, 310, 7), np.full(7, 120.0)])
-    ones = np.ones(7)
-    features = slam.StereoFeatures(0.0, rows, rows, ones, ones, ones, np.ones(7, np.int8), np.ones((7, 4), np.float32))
-    assert outside_masks(features, frame, sequence.rig).uv_left[:, 0].tolist() == [160, 210, 260, 310]
     frame = open_sequence(with_mask("synthetic:desk?frames=3", f",{tmp_path / 'left half.png'}"))[0]
-    assert np.isfinite(outside_masks(features, frame, sequence.rig).uv_right[:, 0]).tolist() == [False] * 3 + [True] * 4
+    assert frame.left_mask is None and not frame.right_mask[:, :160].any()
     cv2.imwrite(str(two_folders / "m.png"), np.eye(48, 64, dtype=np.uint8))
     frame = next(iter(open_sequence(f"{two_folders}?mask=m.png")))
     assert (frame.left_mask == frame.right_mask).all() and frame.left_mask.sum() == 48
@@ -305,6 +295,15 @@ def test_a_true_path_is_given_by_an_option(two_folders: Path) -> None:
     truth.write_tum(two_folders / "true.txt")
     found = open_sequence(f"{two_folders}?truth=true.txt").ground_truth
     np.testing.assert_allclose(found.poses, truth.poses, atol=1e-8)
+    assert open_sequence(f"{two_folders}?truth=true.txt").truth_noise == TruthNoise()
+    noise = open_sequence(f"{two_folders}?truth=true.txt&truth_sigma=0.002,0.2").truth_noise
+    assert noise == TruthNoise(rotation=np.radians(0.2), translation=0.002)
+    for query, said in (
+        ("truth=true.txt&truth_sigma=2mm", "truth_sigma in metres"),
+        ("truth_sigma=0.1", "does nothing"),
+    ):
+        with pytest.raises(ConfigurationError, match=said):
+            open_sequence(f"{two_folders}?{query}")
     slam.Trajectory(stamps * 1e3, truth.poses).write_tum(two_folders / "ms.txt")
     (said,) = open_sequence(f"{two_folders}?truth=ms.txt").warnings[-1:]
     assert f"1 of {len(stamps)} images have a true pose" in said

@@ -7,64 +7,33 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 
-from slam.errors import CalibrationError, ConfigurationError, SequenceError, SlamError
+from slam.errors import CalibrationError, SequenceError
 from slam.sequences import open_sequence
 
 RIGHT = {"euroc": "mav0/cam1", "kitti": "image_1", "raw": "image_01", "two_folders": "right"}
 
 
-FORMATS = tuple(RIGHT)
-
-
-def refused(path, error=SlamError, words=None, seconds=1.0):
+def refused(path, error, words):
     """Opening and reading it ends in one line, within a second of processor time."""
     started = time.process_time()
     with pytest.raises(error, match=words) as caught:
         list(open_sequence(path))
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 700
-    assert time.process_time() - started < seconds
+    assert time.process_time() - started < 1.0
     return str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("query", "error", "words"),
-    [
-        ("left=nowhere", SequenceError, "there is no such folder or video"),
-        ("calibration=nowhere.yaml", CalibrationError, "the calibration is missing"),
-        ("times=t.txt&fps=3", ConfigurationError, "'fps' does nothing here"),
-        ("fps=3&kind=driving&fps=30", ConfigurationError, "option 'fps' is given twice"),
-        ("fps=0", ConfigurationError, "fps must be a number from 0.001"),
-        ("rectified=yes", CalibrationError, "P1, P2 are missing"),
-        ("speed=3", ConfigurationError, "format folders: unknown option 'speed'; known: calibration, fi"),
-        ("mask=black.png", ConfigurationError, "black all over"),
-        ("mask=small.png", ConfigurationError, "another size"),
-    ],
-)  # fmt: skip
-def test_options_that_are_none(two_folders, query, error, words):
-    (two_folders / "t.txt").write_text("".join(f"{i}\n" for i in range(6)))
-    cv2.imwrite(str(two_folders / "black.png"), np.zeros((48, 64), np.uint8))
-    cv2.imwrite(str(two_folders / "small.png"), np.ones((4, 4), np.uint8))
-    refused(f"{two_folders}?{query}", error, words)
-
-
-@pytest.mark.parametrize("fixture", FORMATS)
+@pytest.mark.parametrize("fixture", RIGHT)
 def test_a_right_camera_that_is_none(fixture, request, build):
     folder: Path = request.getfixturevalue(fixture)
-    right, images = folder / RIGHT[fixture], sorted((folder / RIGHT[fixture]).rglob("*.png"))
-    for path in images:
+    for path in (folder / RIGHT[fixture]).rglob("*.png"):
         build.write_image(path, 0, width=60)
     refused(folder, SequenceError, r"differ in size: .* is 64x48, .* is 60x48")
-    for path in images:
-        path.unlink()
-    refused(folder, SequenceError, r"no images|none of the 6 images")
-    shutil.rmtree(right)
+    shutil.rmtree(folder / RIGHT[fixture])
     assert str(folder) in refused(folder, SequenceError, "two cameras are needed")
-    right.write_text("hello")
-    refused(folder, SequenceError, r"a file where a folder|two cameras are needed")
 
 
 def test_calibrations_of_other_cameras(euroc, kitti, raw, two_folders, build):
@@ -96,12 +65,6 @@ def test_images_that_never_pair(euroc, kitti, two_folders, build):
     refused(two_folders, SequenceError, r"left has 5 images and .*right has 6")
 
 
-@pytest.mark.parametrize(("step", "words"), [(0, "6 images stand still"), (-1, "6 images run backwards")])
-def test_times_that_do_not_go_on_are_named(two_folders, step, words):
-    (two_folders / "times.txt").write_text("".join(f"{100 + i * step}\n" for i in range(6)))
-    refused(two_folders, SequenceError, words)
-
-
 def test_rows_that_are_no_stamps_or_in_wrong_order_cost_their_frames(euroc, kitti):
     table = euroc / "mav0" / "cam0" / "data.csv"
     lines = table.read_text().splitlines()
@@ -119,22 +82,6 @@ def test_rows_that_are_no_stamps_or_in_wrong_order_cost_their_frames(euroc, kitt
         (kitti / "times.txt").write_text(text)
         sequence = open_sequence(kitti)
         assert np.allclose(sequence.stamps, stamps) and words in sequence.warnings[0]
-
-
-def test_one_camera_ahead_of_the_other(euroc: Path, kitti: Path, build: SimpleNamespace) -> None:
-    stamps = [build.T0 + i * build.STEP for i in range(6)]
-    build.write_csv(euroc / "mav0" / "cam1", stamps[2:])
-    build.write_csv(euroc / "mav0" / "cam0", stamps[:5])
-    for name in ("image_1/000000.png", "image_1/000001.png", "image_0/000005.png"):
-        (kitti / name).unlink()
-    for folder in (euroc, kitti):
-        sequence = open_sequence(folder)
-        assert [f.right is not None for f in sequence] == [True] * 3
-        text = "\n".join(sequence.warnings)
-        assert "2 images before the first pair left out" in text
-        assert "1 image without a partner" in text
-    assert np.allclose(sequence.stamps, [0.2, 0.3, 0.4])
-    assert np.allclose(sequence.ground_truth.positions[:, 2], [3, 4.5, 6])
 
 
 def test_listed_images_that_are_missing_and_stamps_that_differ_a_little(euroc: Path, build: SimpleNamespace) -> None:

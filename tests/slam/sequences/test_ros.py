@@ -56,12 +56,6 @@ def test_a_single_wrong_stamp_costs_its_frame(tmp_path: Path) -> None:
     assert [left for left, _ in seeds(slam.open_sequence(write(tmp_path / "a.bag", rows)))] == [0, 1, 2, 4, 5, 6, 7]
 
 
-@pytest.mark.parametrize("option", ["unit=cm", "fisheye=yes"])
-def test_camera_messages_are_in_metres_and_name_their_lenses(bag: Path, option: str) -> None:
-    with pytest.raises(ConfigurationError, match=r"does nothing with .*camera_info, which is ROS's"):
-        slam.open_sequence(f"{bag}?{option}")
-
-
 @pytest.mark.parametrize(
     "kind",
     ["ros1", "mcap", "db3", "packed folder", "packed mcap", "single folder"],
@@ -147,25 +141,10 @@ def test_compressed_images(tmp_path: Path) -> None:
     assert seeds(sequence) == [(k, k + 10) for k in range(6)]
 
 
-def test_a_damaged_image_costs_its_frame_alone(tmp_path: Path) -> None:
-    store, rows = STORES[1], stereo(STORES[1])
-    for k, (topic, kind, time, message) in enumerate(rows):
-        if topic == LEFT and message.header.stamp.nanosec == (T0 + 2 * STEP) % 10**9:
-            rows[k] = (topic, kind, time, image(store, T0 + 2 * STEP, picture(2)[:, :32]))
-    sequence = slam.open_sequence(write(tmp_path / "hurt.bag", rows))
-    assert seeds(sequence) == [(k, k + 10) for k in (0, 1, 3, 4, 5)]
-    assert sequence.warnings == ["frame 2 skipped: /stereo/left/image_raw, message 2: image is 32x48, not 64x48"]
-
-
 def test_topics_can_be_named_and_a_missing_one_lists_those_there_are(bag: Path) -> None:
-    assert len(slam.open_sequence(f"{bag}?left={LEFT}&right={RIGHT}")) == 6
+    assert np.allclose(slam.open_sequence(f"{bag}?left={LEFT}&right={RIGHT}&fps=3").stamps, np.arange(6) / 3)
     with pytest.raises(SequenceError, match=rf"/stereo/lft/image_raw: there is none .*mean '{LEFT}'.*{LEFT}, {RIGHT}"):
         slam.open_sequence(f"{bag}?left=/stereo/lft/image_raw&right={RIGHT}")
-    with pytest.raises(SequenceError, match=r"it holds sensor_msgs/msg/CameraInfo"):
-        slam.open_sequence(f"{bag}?left=/stereo/left/camera_info&right={RIGHT}")
-    with pytest.raises(ConfigurationError, match="name both topics"):
-        slam.open_sequence(f"{bag}?left={LEFT}")
-    assert np.allclose(slam.open_sequence(f"{bag}?fps=3").stamps, np.arange(6) / 3)
     with pytest.raises(ConfigurationError, match="left and right are the same topic"):
         slam.open_sequence(f"{bag}?left={LEFT}&right={LEFT}")
 
@@ -200,8 +179,6 @@ def test_one_topic_with_both_images_side_by_side(tmp_path: Path) -> None:
         assert (sequence.rig.width, sequence.rig.height) == (WIDTH, HEIGHT)
         assert seeds(sequence) == [(k, k + 10) for k in range(6)]
         assert np.diff(sequence.stamps) == pytest.approx(1e-9 * STEP, abs=1e-6)
-    with pytest.raises(CalibrationError, match=r"calibration\.yaml: the calibration is missing: .* is it five\.yaml"):
-        slam.open_sequence(f"{path}?layout=sbs")
     two = write(tmp_path / "two.bag", stereo(store))
     with pytest.raises(SequenceError, match=rf"several topics of images, choose one: left={LEFT}; left={RIGHT}"):
         slam.open_sequence(f"{two}?layout=sbs&calibration=five.yaml")

@@ -73,12 +73,3 @@ def test_a_frame_s_copy_leaves_what_waits_for_a_depth_as_it_was(window):
             (table.first_covariance, np.eye(6)),
         ):  # fmt: skip
             np.testing.assert_array_equal(column[1], np.broadcast_to(first, column[1].shape))
-
-
-def test_landmarks_of_a_saved_map_take_unused_rows():
-    tracks = followed(3)
-    looks = features(6)
-    assert not len(tracks.mapped)
-    tracks = tracks.with_landmarks(LandmarkTable(np.arange(6) + 9, looks.descriptors, looks.laplacian))
-    assert tracks.landmarks().ids.tolist() == list(range(9, 15)) and (tracks.ids[:3] < 0).all()
-    np.testing.assert_array_equal(tracks.landmarks().descriptors, looks.descriptors)

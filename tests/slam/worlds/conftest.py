@@ -10,7 +10,8 @@ import pytest
 
 from slam.worlds import WorldSequence, open_world
 from slam.worlds.geometry import Parts, rectangle
-from slam.worlds.scenes import Scene, assemble
+from slam.worlds.scenes import assemble
+from slam.worlds.world import Scene
 
 
 @dataclass(frozen=True)

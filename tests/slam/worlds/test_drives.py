@@ -30,7 +30,7 @@ def test_paths_are_read_in_the_forms_of_kitti_and_tum(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "has 8 columns, found"),
+        ("", "its 8 columns must be stamp tx ty tz qx qy qz qw"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n", r"a path of 0\.0 m in 1 poses; a drive needs 10 m to 100 km"),
         ("1 0 0 0 0 0 0 0 0 0 1 0\n", "the pose of row 0 has no rotation"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n-1 0 0 0 0 -1 0 0 0 0 1 20\n", "y axis must point downwards"),
