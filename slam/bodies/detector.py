@@ -37,7 +37,6 @@ from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
 from slam.tracks.table import Tracks
 
-_NONE: IndexArray = np.zeros(0, np.intp)
 _FORGOTTEN = 8.0  # [s] after which an unseen body is forgotten
 
 
@@ -124,7 +123,7 @@ class MovingObjectDetector(ObjectDetector):
 
     def step(
         self, recent: RecentPoses | None, tracks: Tracks, features: StereoFeatures, estimate: Estimate,
-        still: IndexArray = _NONE,
+        still: IndexArray = NO_IDS,
     ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
         """Follow all tracks into this frame, test them, and find bodies; see `ObjectDetector`."""
         frame = self._begin(recent, tracks, features, estimate)
@@ -146,7 +145,8 @@ class MovingObjectDetector(ObjectDetector):
             for region in moved:
                 self._found(finder.region_group(frame, tracks, region), tracks, frame, far=True)
         self._prove(tracks, frame, scenes)
-        unproven = (tracks.body >= 0) & ~self._of_proven(tracks)
+        proven = of_bodies(tracks, (body for body in self.bodies.values() if body.proven))
+        unproven = (tracks.body >= 0) & ~proven
         expelled = np.flatnonzero(tracks.expelled & tracks.found)
         # of a body that was dropped: nothing is known of these until a group could be found
         unproven[expelled[tracks.count(expelled) < MIN_FRAMES + RUN]] = True
@@ -154,7 +154,7 @@ class MovingObjectDetector(ObjectDetector):
         self.suspects = np.unique(suspected[suspected >= 0])
         self._begin_estimates(tracks, frame)
         self._begin_tracks(tracks, frame)
-        return self._motion_labels(tracks, frame), reported(self.bodies, tracks)
+        return self._motion_labels(tracks, frame, proven), reported(self.bodies, tracks)
 
     def _begin(self, recent: RecentPoses | None, tracks: Tracks, features: StereoFeatures, estimate: Estimate) -> Frame:
         """Move on by a frame; nothing is followed into the first one."""
@@ -298,14 +298,10 @@ class MovingObjectDetector(ObjectDetector):
         record(tracks, new, frame)
         fit_positions(tracks, new)
 
-    def _of_proven(self, tracks: Tracks) -> BoolArray:
-        """Which tracks (N,) belong to a body that has moved for certain."""
-        return of_bodies(tracks, (body for body in self.bodies.values() if body.proven))
-
-    def _motion_labels(self, tracks: Tracks, frame: Frame) -> MotionLabels:
+    def _motion_labels(self, tracks: Tracks, frame: Frame, proven: BoolArray) -> MotionLabels:
         n = len(frame.local)
         on, near = membership.tracks_on_bodies(self.bodies, tracks)
         moving = among(n, tracks.row[on])
         undecided = among(n, np.append(tracks.row[near], tracks.row[tracks.found & tracks.doubtful]))
-        landmarks = np.sort(tracks.ids[self._of_proven(tracks) & (tracks.ids >= 0)])
+        landmarks = np.sort(tracks.ids[proven & (tracks.ids >= 0)])
         return MotionLabels(np.flatnonzero(moving), np.flatnonzero(undecided & ~moving), landmarks)

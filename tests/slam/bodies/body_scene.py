@@ -58,12 +58,14 @@ class BodyScene:
 
     def observations(self, k: int, rng: np.random.Generator, outliers: float = 0.0) -> ObjectObservations:
         """The body in frame k; a share of its points is measured elsewhere on it, or with a wrong right pixel."""
-        uv, seen = self._seen(k, se3.transform(self.body[k], self.points), rng)
+        points = se3.transform(self.body[k], self.points)
+        uv, seen = self._seen(k, points, rng)
         bad = rng.random(len(uv)) < outliers
         offsets = rng.uniform(5, 30, (len(uv), 3)) * rng.choice([-1, 1], (len(uv), 3))
         uv[bad] += offsets[bad][:, [0, 1, 2, 1]]
         rows = np.flatnonzero(seen)
-        return ObjectObservations(7, rows + 1000, uv[rows, :2], uv[rows, 2:])
+        T = se3.pose(np.eye(3), points.mean(axis=0))
+        return ObjectObservations(7, rows + 1000, uv[rows, :2], uv[rows, 2:], T)
 
     def _seen(self, k: int, points: Array, rng: np.random.Generator) -> tuple[Array, Array]:
         """Noisy (uL, vL, uR, vR) of points in frame k; on the right the row has the noise of the left one."""
