@@ -54,10 +54,9 @@ class ObjectDetector:
     def parting(
         self, tracks: Tracks, features: StereoFeatures, at: IndexArray, rows: IndexArray, T_world_left: Array
     ) -> IdArray:
-        """Ids of landmarks that may have begun to move in this frame or the last ones: see `suspects`.
+        """Ids of landmarks that may have begun to move: of those `at` rows of the table (K,), found as `rows` (K,).
 
-        The table is as the last frame left it; `at` are rows in it of the landmarks found in this frame (K,), and
-        `rows` those of their features (K,). The pose (4, 4) is that before the back end's update.
+        The table is as the last frame left it, the pose (4, 4) that before the back end's update.
         """
         return np.zeros(0, np.int64)
 
@@ -172,7 +171,7 @@ class MovingObjectDetector(ObjectDetector):
         return Frame(s, self._number, features, local, self._stamps.copy(), self._poses.copy(), cameras)
 
     def _advance_bodies(self, tracks: Tracks, frame: Frame) -> None:
-        """Predict all bodies; forget those that were not seen for long, or are gone before they were proven."""
+        """Predict all bodies; forget those not seen for long, and those gone before they were proven."""
         now, dt = frame.features.stamp, frame.dt
         for body in list(self.bodies.values()):
             if now - body.seen_at > _FORGOTTEN or (body.gone and not body.proven):

@@ -1,10 +1,9 @@
 """The estimate of a moving body: the camera in its last frames, moving among the body's points.
 
 Seen from the body it is the camera that moves: so a body is a window of camera poses in the body and of points, solved
-by `slam.window` as the camera's own window is. What ties the frames together besides the points is the body's motion,
-constant velocity in the world but for random impulses; there the camera's own motion comes in, with its uncertainty.
-Frames that leave are marginalised, so that a body that is seen for long does not drift. The camera's estimate is read
-and never changed.
+by `slam.window`. What ties the frames together besides the points is the body's motion, constant velocity in the world
+but for random impulses, by the camera's own motion with its uncertainty. Frames that leave are marginalised, so that a
+body that is seen for long does not drift. The camera's estimate is read and never changed.
 """
 
 from __future__ import annotations
