@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -48,21 +47,15 @@ Image = np.ndarray
 Spoil = Callable[[Image, Image, np.random.Generator], tuple[Image, Image]]
 
 
-def noisy(sigma: float) -> Spoil:
-    """Sensor noise [grey levels]."""
-    return lambda left, right, rng: (left + rng.normal(0, sigma, left.shape), right + rng.normal(0, sigma, right.shape))
+def noisy(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
+    """Sensor noise of 10 grey levels."""
+    return left + rng.normal(0, 10.0, left.shape), right + rng.normal(0, 10.0, right.shape)
 
 
 def flickering(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
     """Both images up to 30 % brighter or darker, differently in each frame."""
     gain = rng.uniform(0.7, 1.3)
     return gain * left, gain * right
-
-
-def lowered(image: Image, rows: float) -> Image:
-    """The image lower by so many rows."""
-    size, by = image.shape[1::-1], np.array([[1.0, 0.0, 0.0], [0.0, 1.0, rows]])
-    return cv2.warpAffine(image, by, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 @dataclass(frozen=True)
@@ -77,10 +70,10 @@ class Fault:
 NONE = Fault("none", lambda left, right, _: (left, right))
 FAULTS = (
     Fault("right image 1.3 times as bright", lambda left, right, _: (left, 1.3 * right)),
-    Fault("noise of 10 grey levels", noisy(10.0)),
+    Fault("noise of 10 grey levels", noisy),
     Fault("flicker of 30 %", flickering),
     Fault("5 frames a second", NONE.spoil, 2),
-    Fault("right image 1 px lower", lambda left, right, _: (left, lowered(right, 1.0))),
+    Fault("right image 1 px lower", lambda left, right, _: (left, np.vstack([right[:1], right[:-1]]))),
 )
 
 

@@ -17,14 +17,13 @@ from typing import Any
 import numpy as np
 
 from slam import registry
-from slam.data import BoolArray
 from slam.errors import ConfigurationError, UnknownNameError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import so3_exp
 from slam.naming import unknown
 from slam.worlds.options import FAULTS, IMAGING, OBSERVATION, RECORDING, Option, option_table, parse_query
 from slam.worlds.scenes import SCENES, assemble
-from slam.worlds.sequence import WorldSequence
+from slam.worlds.sequence import Masks, WorldSequence
 from slam.worlds.world import Scene, World
 
 __all__ = ["WorldSequence", "describe", "describe_common", "names", "open_world", "options"]
@@ -39,11 +38,7 @@ def names() -> list[str]:
     return list(SCENES)
 
 
-#: Reads the masks of both cameras, (H, W) bool, from the option ``mask`` for a rig.
-ReadMasks = Callable[[str, StereoRig], tuple[BoolArray | None, BoolArray | None]]
-
-
-def open_world(text: str, read_masks: ReadMasks | None = None) -> WorldSequence:
+def open_world(text: str, read_masks: Callable[[str, StereoRig], Masks] | None = None) -> WorldSequence:
     """The recording that a text such as ``"aisle?frames=200&seed=3"`` describes.
 
     A world of one's own is ``"my_module:SCENE?frames=200"``, a `slam.worlds.world.Scene`. The option ``mask`` needs

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -97,16 +97,9 @@ class Lens:
         return cv2.resize(samples, size, interpolation=cv2.INTER_AREA)
 
 
-class TruthImages(NamedTuple):
-    """Truth of every pixel of the left image."""
-
-    depth: np.ndarray  # distance along the optical axis (H, W) float32 [m]; 0 where nothing is
-    objects: np.ndarray  # object (H, W) int32; 0 for the still world, and where nothing is
-
-
 @lru_cache(maxsize=1)
-def truth_images(world: World, frame: int) -> TruthImages:
-    """Depth and objects in one frame's left image, at the pixels' centres, also of a camera with distortion."""
+def truth_images(world: World, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (H, W) float32 [m], 0 for none, and objects (H, W) int32, at the centres of the left image's pixels."""
     lens, bodies = Lens.of(world.rig.left, 1), world.T_world_body(frame)
     placed = place(world.arrays, bodies, world.T_world_left[frame], lens.view)
     labels = shown(placed, lens.view).astype(int)
@@ -116,9 +109,7 @@ def truth_images(world: World, frame: int) -> TruthImages:
         labels = labels[np.rint(y).astype(int), np.rint(x).astype(int)]
     planes = np.concatenate([[[0.0, 0.0, np.inf]], placed.Q[:, 2]])[labels]  # row 0: nothing, whose depth is 0
     depth = 1 / (planes[..., 0] * x + planes[..., 1] * y + planes[..., 2])
-    return TruthImages(
-        depth.astype(np.float32), np.append(0, world.arrays.body[placed.source])[labels].astype(np.int32)
-    )
+    return depth.astype(np.float32), np.append(0, world.arrays.body[placed.source])[labels].astype(np.int32)
 
 
 def sense(image: np.ndarray, values: Mapping[str, Any], black: bool, rng: np.random.Generator) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slam.data import StereoFeatures, StereoFrame
+from slam.data import BoolArray, StereoFeatures, StereoFrame
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range, require_frame
@@ -21,7 +21,10 @@ from slam.worlds.options import faulty_frames
 from slam.worlds.world import World
 
 if TYPE_CHECKING:
-    from slam.worlds.recorder import Recorder, TruthImages
+    from slam.worlds.recorder import Recorder
+
+
+Masks = tuple[BoolArray | None, BoolArray | None]  #: of both cameras (H, W), see `slam.data.StereoFrame`
 
 
 class WorldSequence:
@@ -48,7 +51,7 @@ class WorldSequence:
         self.world, self.landmarks = world, world.landmarks
         self.rig = world.rig if rig is None else rig
         self.warnings: list[str] = []
-        self.masks: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
+        self.masks: Masks = (None, None)
         self.faults = faulty_frames(values, len(world), values["seed"])
         self._kept = np.flatnonzero(~self.faults["drop"])
         self.stamps: Array = world.stamps[self._kept]
@@ -95,11 +98,11 @@ class WorldSequence:
 
     def depth(self, k: int) -> np.ndarray:
         """True distance along the left camera's axis in frame k (H, W) float32 [m], 0 where nothing is."""
-        return self._truth(k).depth
+        return self._truth(k)[0]
 
     def object_ids(self, k: int) -> np.ndarray:
         """Which object each pixel of frame k's left image shows (H, W) int32, 0 for the still world."""
-        return self._truth(k).objects
+        return self._truth(k)[1]
 
     def objects(self, k: int) -> Array:
         """Poses ``T_world_object`` (B, 4, 4) of the moving objects 1 to B in frame k."""
@@ -127,7 +130,7 @@ class WorldSequence:
 
         return Recorder(self.world, self.values, self.faults)
 
-    def _truth(self, k: int) -> TruthImages:
+    def _truth(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         from slam.worlds.recorder import truth_images
 
         return truth_images(self.world, self.source(k))

@@ -38,8 +38,6 @@ def test_a_folder_that_is_missing_or_empty(slam_command, tmp_path):
     (tmp_path / "empty").mkdir()
     fails_with_one_line(in_a_new_process("run", tmp_path / "nowhere", "--out", tmp_path / "out"), "nowhere")
     fails_with_one_line(slam_command("run", tmp_path / "empty", "--out", tmp_path / "out"), "empty")
-    for command in ("run", "render"):
-        fails_with_one_line(slam_command(command, "", "--out", tmp_path / "out"), "path is empty")
 
 
 def test_a_recording_is_no_place_for_a_run_and_no_trial_is_no_comparison(slam_command, euroc, tmp_path):

@@ -52,13 +52,6 @@ def test_noise_alone_is_a_difference_in_few_reports_however_many_figures():
     assert 1 <= sum(set(verdicts) != {"open"} for verdicts in reports) <= 18  # p < 0.01 for more
 
 
-def test_failed_runs_are_counted_and_their_pairs_left_out():
-    reference, other = pairs(8)
-    reference[2] = other[5] = np.nan
-    d = difference(ATE, reference, other)
-    assert (d.pairs, d.missing) == (6, 2)
-
-
 def test_each_figure_that_the_sentence_names_is_in_the_first_table(tmp_path):
     plan, drifts = Plan(("synthetic:desk",), ("ekf", "window"), trials=6), pairs(6)
     runs = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -18,11 +17,3 @@ def _written(name: str, folder: str) -> Callable[[Path], Path]:
 
 euroc, kitti = _written("euroc", "V0_01"), _written("kitti", "dataset")
 raw, two_folders = _written("raw", "2011_09_26"), _written("two_folders", "mine")
-
-
-@pytest.fixture
-def build() -> SimpleNamespace:
-    """The functions that tests change a sequence with."""
-    return SimpleNamespace(
-        **vars(recordings), size=(recordings.WIDTH, recordings.HEIGHT), T_body_camera=recordings.BODY_CAMERA
-    )

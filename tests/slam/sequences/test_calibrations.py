@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,6 +14,7 @@ import slam
 from slam.errors import CalibrationError, ConfigurationError
 from slam.geometry.camera import in_units
 from slam.sequences import open_sequence
+from tests import recordings
 
 SIZE = (64, 48)
 SIDES = ("left", "right")
@@ -171,9 +171,9 @@ def test_the_same_rig_in_the_words_of_many_programs_and_people(tmp_path: Path, n
 
 
 @pytest.mark.parametrize(("length", "units"), [(120.0, "cm mm"), (12.0, "cm in"), (4.73, "cm in"), (0.1, "")])
-def test_a_unit_that_is_proposed_gives_the_baseline_that_is_said(tmp_path: Path, build, caplog, length, units):
-    entries = build.stereo_entries(length)
-    build.write_storage(tmp_path / "calibration.yaml", entries)
+def test_a_unit_that_is_proposed_gives_the_baseline_that_is_said(tmp_path: Path, caplog, length, units):
+    entries = recordings.stereo_entries(length)
+    recordings.write_storage(tmp_path / "calibration.yaml", entries)
     proposed = re.findall(r"unit=(\w+) makes it (\S+) m", in_units(slam.load_rig(tmp_path, size=SIZE).baseline))
     assert [unit for unit, _ in proposed] == units.split()
     assert ("m apart by their calibration: is it in metres?" in caplog.text) == (length > 10)
@@ -189,15 +189,15 @@ def test_a_folder_s_calibration_is_that_of_its_sequence(fixture: str, request) -
     assert same(slam.load_rig(where, size=size), open_sequence(folder).rig)
 
 
-def test_opencv_s_entries_by_all_their_names_project_as_opencv_does(tmp_path: Path, build: SimpleNamespace) -> None:
+def test_opencv_s_entries_by_all_their_names_project_as_opencv_does(tmp_path: Path) -> None:
     """OpenCV's sample writes M1, D1, M2, D2 to intrinsics.yml and R, T to extrinsics.yml."""
-    e = build.stereo_entries()
-    build.write_storage(tmp_path / "all.xml", e)
-    build.write_storage(tmp_path / "intrinsics.yml", {"M1": e["K1"], "D1": e["D1"], "M2": e["K2"], "D2": e["D2"]})
-    build.write_storage(tmp_path / "extrinsics.yml", {"R": e["R"], "T": e["T"], "Q": np.eye(4)})
+    e = recordings.stereo_entries()
+    recordings.write_storage(tmp_path / "all.xml", e)
+    recordings.write_storage(tmp_path / "intrinsics.yml", {"M1": e["K1"], "D1": e["D1"], "M2": e["K2"], "D2": e["D2"]})
+    recordings.write_storage(tmp_path / "extrinsics.yml", {"R": e["R"], "T": e["T"], "Q": np.eye(4)})
     words = {f"camera_matrix_{side}": e[f"K{i}"] for i, side in ((1, "left"), (2, "right"))}
     words |= {f"dist_coeffs_{side}": e[f"D{i}"] for i, side in ((1, "left"), (2, "right"))}
-    build.write_storage(tmp_path / "words.json", words | {"R": cv2.Rodrigues(e["R"])[0], "T": e["T"] * 1000})
+    recordings.write_storage(tmp_path / "words.json", words | {"R": cv2.Rodrigues(e["R"])[0], "T": e["T"] * 1000})
     rig = slam.StereoRig.from_pinhole(e["K1"], e["K2"], D_left=e["D1"], D_right=e["D2"], R=e["R"], T=e["T"], size=SIZE)
     assert same(slam.load_rig(tmp_path / "all.xml", size=SIZE), rig)
     assert same(slam.load_rig(tmp_path, size=SIZE), rig)
@@ -209,11 +209,11 @@ def test_opencv_s_entries_by_all_their_names_project_as_opencv_does(tmp_path: Pa
     assert np.allclose(right, cv2.projectPoints(points, turn, e["T"], e["K2"], e["D2"])[0][:, 0], atol=1e-9)
 
 
-def test_rectified_images_take_the_projection_matrices(tmp_path: Path, build: SimpleNamespace) -> None:
-    e = build.stereo_entries()
+def test_rectified_images_take_the_projection_matrices(tmp_path: Path) -> None:
+    e = recordings.stereo_entries()
     R1, R2, P1, P2 = cv2.stereoRectify(e["K1"], e["D1"], e["K2"], e["D2"], SIZE, e["R"], e["T"])[:4]
-    build.write_storage(tmp_path / "a.yml", {**e, "R1": R1, "R2": R2, "P1": P1, "P2": P2})
-    build.write_storage(tmp_path / "p.yml", {"P1": P1, "P2": P2})
+    recordings.write_storage(tmp_path / "a.yml", {**e, "R1": R1, "R2": R2, "P1": P1, "P2": P2})
+    recordings.write_storage(tmp_path / "p.yml", {"P1": P1, "P2": P2})
     rig = slam.load_rig(tmp_path / "a.yml", size=SIZE, rectified=True)
     assert rig.is_rectified and rig.baseline == pytest.approx(np.linalg.norm(e["T"]), rel=1e-9)
     assert same(slam.load_rig(tmp_path / "p.yml", size=SIZE), rig)
@@ -222,20 +222,20 @@ def test_rectified_images_take_the_projection_matrices(tmp_path: Path, build: Si
         slam.load_rig(tmp_path / "p.yml", size=SIZE, fisheye=True)
 
 
-def test_distortions_of_every_kind_and_length(tmp_path: Path, build: SimpleNamespace) -> None:
-    file, e = tmp_path / "a.yml", build.stereo_entries()
+def test_distortions_of_every_kind_and_length(tmp_path: Path) -> None:
+    file, e = tmp_path / "a.yml", recordings.stereo_entries()
     e["D1"] = e["D2"] = np.array([[0.01, 0.002, -0.001, 0.0003]])
-    build.write_storage(file, e)
+    recordings.write_storage(file, e)
     points = np.array([[[0.1, -0.2, 2.0], [0.5, 0.3, 1.0]]])
     expected = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), e["K1"], e["D1"])[0][0]
     assert np.allclose(slam.load_rig(file, size=SIZE, fisheye=True).left.project(points[0]), expected, atol=1e-9)
     for count, kept in ((4, 4), (5, 5), (8, 8), (14, 8)):
         D = np.zeros((1, count))
         D[0, : min(count, 8)] = 0.01
-        build.write_storage(file, e | {"D1": D, "D2": D})
+        recordings.write_storage(file, e | {"D1": D, "D2": D})
         assert len(slam.load_rig(file, size=SIZE).left.distortion) == kept
     D[0, 9] = 0.1
-    build.write_storage(file, {**e, "D1": D})
+    recordings.write_storage(file, {**e, "D1": D})
     with pytest.raises(CalibrationError, match="thin prisms"):
         slam.load_rig(file, size=SIZE)
 

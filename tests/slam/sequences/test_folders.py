@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -166,7 +165,7 @@ def test_one_folder_with_both_cameras_in_it_and_patterns(two_folders: Path) -> N
     assert len(open_sequence(f"{two_folders.parent}?{inside}")) == 6
 
 
-def test_images_and_videos_side_by_side(two_folders: Path, tmp_path: Path, build: SimpleNamespace) -> None:
+def test_images_and_videos_side_by_side(two_folders: Path, tmp_path: Path) -> None:
     folder, film = tmp_path / "double", tmp_path / "walk.avi"
     folder.mkdir()
     pairs = [sorted((two_folders / side).iterdir()) for side in ("left", "right")]
@@ -184,12 +183,12 @@ def test_images_and_videos_side_by_side(two_folders: Path, tmp_path: Path, build
         assert (sequence.name, len(sequence), sequence.rig.width) == (name, 6, 64)
         assert np.allclose(sequence.stamps, step * np.arange(6))
     assert seeds(open_sequence(f"{folder}?layout=sbs&swap=yes")) == [(b, a) for a, b in PAIRS]
-    build.write_image(folder / "3.png", 3, 131)
+    recordings.write_image(folder / "3.png", 3, 131)
     assert [f.index for f in open_sequence(f"{folder}?layout=sbs")] == [0, 1, 2, 4, 5]
 
 
 @pytest.mark.parametrize("clockwise", [1, -1])
-def test_cameras_above_each_other_are_turned(two_folders: Path, build: SimpleNamespace, clockwise: int) -> None:
+def test_cameras_above_each_other_are_turned(two_folders: Path, clockwise: int) -> None:
     """A rig turned by a quarter, and its images with it, gives the frames and the rig of the upright one."""
     upright = open_sequence(two_folders)
     turned = [camera.turned(-clockwise) for camera in (upright.rig.left, upright.rig.right)]
@@ -201,7 +200,7 @@ def test_cameras_above_each_other_are_turned(two_folders: Path, build: SimpleNam
             cv2.imwrite(str(path), np.rot90(cv2.imread(str(path), 0), -clockwise))
     entries = {f"K{i}": c.K for i, c in enumerate(turned, 1)} | {"R": R, "T": R @ b}
     entries |= {f"D{i}": np.array([c.distortion]) for i, c in enumerate(turned, 1)}
-    build.write_storage(two_folders / "calibration.yaml", entries)
+    recordings.write_storage(two_folders / "calibration.yaml", entries)
     sequence = open_sequence(two_folders)
     assert sequence.rig.turns % 4 == clockwise % 4
     for a, c in ((sequence.rig.left, upright.rig.left), (sequence.rig.right, upright.rig.right)):
@@ -213,9 +212,9 @@ def test_cameras_above_each_other_are_turned(two_folders: Path, build: SimpleNam
         slam.load_rig(two_folders, size=(48, 64))
 
 
-def test_the_truth_of_cameras_above_each_other_is_the_turned_camera_s(euroc: Path, build: SimpleNamespace) -> None:
+def test_the_truth_of_cameras_above_each_other_is_the_turned_camera_s(euroc: Path) -> None:
     upright = open_sequence(euroc).ground_truth
-    build.write_sensor(euroc / "mav0" / "cam1" / "sensor.yaml", 0.11, axis=1)
+    recordings.write_sensor(euroc / "mav0" / "cam1" / "sensor.yaml", 0.11, axis=1)
     sequence = open_sequence(euroc)
     turn = np.linalg.inv(upright.poses[0]) @ sequence.ground_truth.poses[0]
     assert sequence.rig.turns == 1 and np.allclose(turn[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -251,9 +250,9 @@ def grey(first: int, count: int = 12, size: tuple[int, int] = (64, 48)) -> list[
 
 
 @pytest.fixture
-def videos(tmp_path: Path, build: SimpleNamespace) -> Path:
+def videos(tmp_path: Path) -> Path:
     folder = tmp_path / "films"
-    build.write_storage(folder / "calib.yml", build.stereo_entries())
+    recordings.write_storage(folder / "calib.yml", recordings.stereo_entries())
     write_video(folder / "left.avi", grey(10))
     write_video(folder / "right.avi", grey(100))
     return folder
@@ -278,10 +277,10 @@ def test_two_videos(videos: Path) -> None:
     assert len(list(sequence)) == 9 and "has 12 frames, " in sequence.warnings[0]
 
 
-def test_a_video_that_ends_too_early(videos: Path, build: SimpleNamespace) -> None:
+def test_a_video_that_ends_too_early(videos: Path) -> None:
     noise = [np.random.default_rng(i).integers(0, 255, (48, 64)).astype(np.uint8) for i in range(12)]
     write_video(videos / "left.avi", noise, codec="MJPG")  # so that the frames are most of the file
-    build.cut(videos / "left.avi", 0.7)
+    recordings.cut(videos / "left.avi", 0.7)
     sequence = open_sequence(videos)
     frames = list(sequence)
     assert 0 < len(frames) < len(sequence)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -29,14 +28,14 @@ PAIRS = [(i, i + 10) for i in range(6)]
     ],
 )
 def test_each_format_is_found_out_and_yields_its_frames_in_order(
-    fixture: str, format: str, kind: str, request: pytest.FixtureRequest, build: SimpleNamespace
+    fixture: str, format: str, kind: str, request: pytest.FixtureRequest
 ) -> None:
     folder: Path = request.getfixturevalue(fixture)
     sequence = open_sequence(folder)
     assert isinstance(sequence, Sequence)
     assert (sequence.format, sequence.kind, sequence.name, len(sequence)) == (format, kind, folder.name, 6)
     assert format in formats()
-    assert (sequence.rig.width, sequence.rig.height) == build.size
+    assert (sequence.rig.width, sequence.rig.height) == (recordings.WIDTH, recordings.HEIGHT)
     assert seeds(sequence) == PAIRS
     assert [f.index for f in sequence] == list(range(6))  # a second pass is as good as the first
     stamps = np.array([f.stamp for f in sequence])
@@ -44,9 +43,9 @@ def test_each_format_is_found_out_and_yields_its_frames_in_order(
     assert open_sequence(str(folder), format=format).format == format
 
 
-def test_a_range_of_frames_is_read_without_decoding_the_others(kitti: Path, build: SimpleNamespace) -> None:
+def test_a_range_of_frames_is_read_without_decoding_the_others(kitti: Path) -> None:
     for name in ("000001.png", "000005.png"):  # would be reported if they were decoded
-        build.cut(kitti / "image_0" / name)
+        recordings.cut(kitti / "image_0" / name)
     sequence = open_sequence(kitti)
     for start, stop, found in ((2, 5, [2, 3, 4]), (4, None, [4]), (3, 4, [3])):
         assert [f.index for f in sequence.frames(start, stop)] == found
@@ -61,23 +60,23 @@ def test_a_range_of_frames_is_read_without_decoding_the_others(kitti: Path, buil
 # ------------------------------------------------------------------------------------------------ EuRoC
 
 
-def test_euroc_rig_and_truth(euroc: Path, build: SimpleNamespace) -> None:
+def test_euroc_rig_and_truth(euroc: Path) -> None:
     sequence = open_sequence(euroc / "mav0")
     assert sequence.name == "V0_01"
     assert np.allclose(sequence.rig.R, np.eye(3), atol=1e-12) and np.allclose(sequence.rig.b, [-0.11, 0, 0], atol=1e-12)
     assert sequence.rig.left.distortion == (-0.28, 0.07, 0.0002, 1.8e-05)
     truth = sequence.ground_truth
     assert len(truth) == 24  # denser than the frames, and not thinned
-    assert np.allclose(truth.poses[:, :3, :3], build.T_body_camera[:3, :3])
-    assert np.allclose(truth.positions[3], np.array([0.3, 0, 1]) + build.T_body_camera[:3, 3])
-    assert truth.stamps[4] == sequence.stamps[1] == pytest.approx((build.T0 + build.STEP) / 1e9, abs=1e-6)
+    assert np.allclose(truth.poses[:, :3, :3], recordings.BODY_CAMERA[:3, :3])
+    assert np.allclose(truth.positions[3], np.array([0.3, 0, 1]) + recordings.BODY_CAMERA[:3, 3])
+    assert truth.stamps[4] == sequence.stamps[1] == pytest.approx((recordings.T0 + recordings.STEP) / 1e9, abs=1e-6)
 
 
-def test_own_images_in_euroc_s_tree(euroc: Path, build: SimpleNamespace) -> None:
+def test_own_images_in_euroc_s_tree(euroc: Path) -> None:
     for cam in ("cam0", "cam1"):
         camera = euroc / "mav0" / cam
         (camera / "data.csv").unlink()
-        build.rename(camera / "data", lambda i: f"{i:06d}.png")
+        recordings.rename(camera / "data", lambda i: f"{i:06d}.png")
     sequence = open_sequence(euroc)
     assert np.allclose(sequence.stamps, 0.1 * np.arange(6))
     assert any("10 frames per second assumed" in line for line in sequence.warnings)
@@ -85,7 +84,7 @@ def test_own_images_in_euroc_s_tree(euroc: Path, build: SimpleNamespace) -> None
         (euroc / "mav0" / cam / "sensor.yaml").unlink()
     with pytest.raises(CalibrationError, match="add calibration=FILE"):
         open_sequence(f"{euroc}?fps=10")
-    (euroc / "own.yaml").write_text(build.FIVE)
+    (euroc / "own.yaml").write_text(recordings.FIVE)
     sequence = open_sequence(f"{euroc}?fps=20&calibration=own.yaml")
     assert seeds(sequence) == PAIRS and np.allclose(sequence.stamps, 0.05 * np.arange(6))
     assert sequence.rig.baseline == pytest.approx(0.2)
@@ -170,11 +169,11 @@ def test_lengths_of_oxts_truth_are_those_on_the_earth(step: tuple[float, float])
 
 
 @pytest.mark.parametrize("colour", [False, True])
-def test_kitti_raw_truth_keeps_a_fixed_point_where_it_is(raw: Path, build: SimpleNamespace, colour: bool) -> None:
+def test_kitti_raw_truth_keeps_a_fixed_point_where_it_is(raw: Path, colour: bool) -> None:
     """Through IMU, laser, camera 0, rectification and the offset of the camera in use."""
     rng = np.random.default_rng(6)
     records = [f"{49 + 1e-5 * i} {8 + 2e-5 * i * i} {110 + i} {0.01 * i} {-0.02 * i} {0.3 * i}" for i in range(6)]
-    build.write_oxts(raw, records)
+    recordings.write_oxts(raw, records)
     chain = [Rotation.from_rotvec(rng.normal(0, 0.5, 3)).as_matrix() for _ in range(3)]
     shifts = rng.normal(size=(2, 3))
     words = [" ".join(f"{x:.17g}" for x in a.ravel()) for a in (*chain, *shifts)]
@@ -203,11 +202,11 @@ def test_kitti_raw_truth_keeps_a_fixed_point_where_it_is(raw: Path, build: Simpl
     assert not np.allclose(seen[1], seen[0], atol=0.1)
 
 
-def test_kitti_tracking_as_downloaded(tmp_path: Path, build: SimpleNamespace) -> None:
+def test_kitti_tracking_as_downloaded(tmp_path: Path) -> None:
     root = tmp_path / "training"
     for camera, first in (("image_02", 0), ("image_03", 10)):
         for i in range(6):
-            build.write_image(root / camera / "0003" / f"{i:06d}.png", first + i)
+            recordings.write_image(root / camera / "0003" / f"{i:06d}.png", first + i)
     with pytest.raises(SequenceError, match="below it is image_02/0003: give that"):
         open_sequence(root)
     with pytest.raises(CalibrationError, match="add calibration=FILE"):
@@ -220,11 +219,11 @@ def test_kitti_tracking_as_downloaded(tmp_path: Path, build: SimpleNamespace) ->
     assert seeds(sequence) == PAIRS and sequence.rig.baseline == pytest.approx(0.5)
 
 
-def test_kitti_360_as_downloaded(tmp_path: Path, build: SimpleNamespace) -> None:
+def test_kitti_360_as_downloaded(tmp_path: Path) -> None:
     drive = tmp_path / "data_2d_raw" / "2013_05_28_drive_0000_sync"
     for camera, first in (("image_00", 0), ("image_01", 10)):
         for i in range(6):
-            build.write_image(drive / camera / "data_rect" / f"{i:010d}.png", first + i)
+            recordings.write_image(drive / camera / "data_rect" / f"{i:010d}.png", first + i)
         times = [f"2013-05-28 08:46:{2 + 0.1 * i:012.9f}\n" for i in range(6)]
         (drive / camera / "timestamps.txt").write_text("".join(times))
     rows = ["S_rect_00: 64 48", "R_rect_00: 1 0 0 0 1 0 0 0 1", "S_rect_01: 64 48"]

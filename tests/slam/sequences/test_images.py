@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,6 +14,7 @@ import pytest
 from slam.errors import SequenceError
 from slam.sequences import open_sequence
 from slam.sequences.images import decode_image, read_image
+from tests import recordings
 
 SCENE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (90, 120)).astype(np.uint8), (0, 0), 1.5)
 
@@ -72,10 +72,10 @@ def test_grey_values_are_as_stored_and_colours_become_grey():
         decode_image(large.getvalue(), "x")
 
 
-def test_damaged_vanished_and_other_images_cost_no_more_than_themselves(kitti: Path, build: SimpleNamespace) -> None:
-    build.cut(kitti / "image_1" / "000000.png")
-    build.write_image(kitti / "image_0" / "000002.png", 2, width=32)
-    build.write_image(kitti / "image_1" / "000004.png", 2, width=32)
+def test_damaged_vanished_and_other_images_cost_no_more_than_themselves(kitti: Path) -> None:
+    recordings.cut(kitti / "image_1" / "000000.png")
+    recordings.write_image(kitti / "image_0" / "000002.png", 2, width=32)
+    recordings.write_image(kitti / "image_1" / "000004.png", 2, width=32)
     sequence = open_sequence(kitti)
     (kitti / "image_0" / "000001.png").unlink()
     assert [(f.index, f.right is None) for f in sequence] == [(0, True), (3, False), (4, True), (5, False)]

@@ -5,13 +5,13 @@ from __future__ import annotations
 import shutil
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from slam.errors import CalibrationError, SequenceError
 from slam.sequences import open_sequence
+from tests import recordings
 
 RIGHT = {"euroc": "mav0/cam1", "kitti": "image_1", "raw": "image_01", "two_folders": "right"}
 
@@ -27,40 +27,43 @@ def refused(path, error, words):
 
 
 @pytest.mark.parametrize("fixture", RIGHT)
-def test_a_right_camera_that_is_none(fixture, request, build):
+def test_a_right_camera_that_is_none(fixture, request):
     folder: Path = request.getfixturevalue(fixture)
     for path in (folder / RIGHT[fixture]).rglob("*.png"):
-        build.write_image(path, 0, width=60)
+        recordings.write_image(path, 0, width=60)
     refused(folder, SequenceError, r"differ in size: .* is 64x48, .* is 60x48")
     shutil.rmtree(folder / RIGHT[fixture])
     assert str(folder) in refused(folder, SequenceError, "two cameras are needed")
 
 
-def test_calibrations_of_other_cameras(euroc, kitti, raw, two_folders, build):
-    build.write_sensor(euroc / "mav0" / "cam1" / "sensor.yaml", -0.11)
+def test_calibrations_of_other_cameras(euroc, kitti, raw, two_folders):
+    recordings.write_sensor(euroc / "mav0" / "cam1" / "sensor.yaml", -0.11)
     (kitti / "calib.txt").write_text((kitti / "calib.txt").read_text().replace("-2.500000e+01", "2.500000e+01"))
-    build.write_storage(two_folders / "calibration.yaml", build.stereo_entries(-0.2))
+    recordings.write_storage(two_folders / "calibration.yaml", recordings.stereo_entries(-0.2))
     for folder, name in ((euroc, "sensor.yaml"), (kitti, "calib.txt"), (two_folders, "calib")):
         assert name in refused(folder, CalibrationError, "are the cameras swapped")
-    entries = {**build.stereo_entries(), "image_width": 640, "image_height": 480}
-    build.write_storage(two_folders / "calibration.yaml", entries)
+    entries = {**recordings.stereo_entries(), "image_width": 640, "image_height": 480}
+    recordings.write_storage(two_folders / "calibration.yaml", entries)
     refused(two_folders, SequenceError, r"images are 64x48, but .*calibration\.yaml is for 640x480")
     for path in raw.rglob("*.png"):
-        build.write_image(path, 0, width=74, height=58)
+        recordings.write_image(path, 0, width=74, height=58)
     refused(raw, SequenceError, r"images are 74x58, but .*cam_to_cam\.txt is for 64x48")
     extract = raw.rename(raw.parent / raw.name.replace("sync", "extract"))
     refused(extract, SequenceError, r"an unrectified \(extract\) drive: take the rectified")
 
 
-def test_images_that_never_pair(euroc, kitti, two_folders, build):
-    rows = [f"{build.T0 + i * build.STEP + 20_000_000},{build.T0 + i * build.STEP}.png\n" for i in range(6)]
+def test_images_that_never_pair(euroc, kitti, two_folders):
+    rows = [
+        f"{recordings.T0 + i * recordings.STEP + 20_000_000},{recordings.T0 + i * recordings.STEP}.png\n"
+        for i in range(6)
+    ]
     (euroc / "mav0" / "cam1" / "data.csv").write_text("".join(rows))
     refused(euroc, SequenceError, "the nearest two are 20 ms apart, 5 ms are allowed; see tolerance=")
     for path in (kitti / "image_1").iterdir():
-        build.cut(path)
+        recordings.cut(path)
     refused(kitti, SequenceError, r"no pair of images can be read: .*cut off or damaged")
     for side in ("left", "right"):
-        build.rename(two_folders / side, lambda i: f"{'abcdef'[i]}.png")
+        recordings.rename(two_folders / side, lambda i: f"{'abcdef'[i]}.png")
     (two_folders / "left" / "c.png").unlink()
     refused(two_folders, SequenceError, r"left has 5 images and .*right has 6")
 
@@ -84,8 +87,8 @@ def test_rows_that_are_no_stamps_or_in_wrong_order_cost_their_frames(euroc, kitt
         assert np.allclose(sequence.stamps, stamps) and words in sequence.warnings[0]
 
 
-def test_listed_images_that_are_missing_and_stamps_that_differ_a_little(euroc: Path, build: SimpleNamespace) -> None:
-    stamps = [build.T0 + i * build.STEP for i in range(6)]
+def test_listed_images_that_are_missing_and_stamps_that_differ_a_little(euroc: Path) -> None:
+    stamps = [recordings.T0 + i * recordings.STEP for i in range(6)]
     rows = [f"{s + (-1) ** i * 4_000_000},{s}.png\n" for i, s in enumerate(stamps)]
     (euroc / "mav0" / "cam1" / "data.csv").write_text("".join(rows))
     assert [f.right is not None for f in open_sequence(euroc)] == [True] * 6
