@@ -362,7 +362,7 @@ class FrameResult:
         keyframe: whether the frame has become a keyframe.
         returned: ids of landmarks of an old place that joined the map as another back end took over there.
         common: the part of the pose's error that all frames share; empty after a loop, which mixes it with noise.
-        recent: the last few poses in the back end's own world; None where it does not tell their joint covariance.
+        recent: the last few poses, whose joint covariance the back end tells; None where it does not, and after a loop.
     """
 
     index: int

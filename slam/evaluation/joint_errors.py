@@ -40,7 +40,7 @@ class JointErrors:
     @classmethod
     def of(cls, blocks: Sequence[Array], frames: NDArray[np.intp]) -> JointErrors | None:
         """By covariances (K, 6, 6), for each frame, of the last K poses' errors with its own, which comes last."""
-        if not blocks or not all(map(len, blocks)):  # a back end that tells none, or a path without
+        if not any(map(len, blocks)):  # a back end that tells none, or a path without poses
             return None
         by_lag = np.full((len(blocks), max(map(len, blocks)), _DOF, _DOF), np.nan)
         for k, its in enumerate(blocks):
@@ -77,6 +77,9 @@ class JointErrors:
 def _gains(by_lag: Array, k: int, n: int) -> Array:
     """Of frame k's error by those of the n frames before it (6, 6 (K - 1)), 0 by others; NaN of no frame."""
     K, size = by_lag.shape[1], n * _DOF
+    unknown = np.full((_DOF, (K - 1) * _DOF), np.nan)
+    if n < 1:
+        return unknown
     gains = np.zeros((_DOF, K - 1, _DOF))
     P = np.empty((n, _DOF, n, _DOF))
     for i in range(n):
@@ -86,8 +89,8 @@ def _gains(by_lag: Array, k: int, n: int) -> Array:
     with_it = by_lag[k, 1 : n + 1].transpose(1, 0, 2).reshape(_DOF, size)
     sigma = np.sqrt(np.diag(P.reshape(size, size)))
     correlations = P.reshape(size, size) / np.outer(sigma, sigma)
-    if not n or not np.isfinite(correlations).all():
-        return np.full((_DOF, (K - 1) * _DOF), np.nan)
+    if not np.isfinite(correlations).all():
+        return unknown
     values, axes = np.linalg.eigh(correlations)  # some are negative where an estimate forgot what it had known
     inverse = np.divide(1.0, values, out=np.zeros(size), where=values > _NOTHING)
     gains[:, :n] = ((with_it / sigma) @ (axes * inverse) @ axes.T / sigma).reshape(_DOF, n, _DOF)

@@ -80,9 +80,10 @@ def test_errors_of_each_frame_alone_are_told_from_drift_by_the_last_poses():
     assert np.mean([run["NEES over 10 m"] for run in alone]) > 9.0
 
 
-def test_joint_errors_are_not_known_across_a_frame_before_which_there_is_no_pose():
+@pytest.mark.parametrize("told", [0, 1])
+def test_joint_errors_are_not_known_across_a_frame_of_which_the_back_end_tells_nothing_before(told):
     *_, P, blocks = with_noise_of_each_frame(0)
-    blocks[30] = blocks[30][-1:]
+    blocks[30] = blocks[30][5 - told :]
     first, last = np.array([5, 28, 29, 31, 40, 7]), np.array([20, 30, 40, 34, 55, 7])
     found = JointErrors.of(blocks, np.arange(60)).between(first, last)
     assert np.isfinite(found).all(axis=(1, 2)).tolist() == [True, False, False, True, True, True]
