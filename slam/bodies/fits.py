@@ -104,11 +104,11 @@ def revise_tracks(
 def _shifts(points: Array, T_world_left: Array, rig: StereoRig, correct: Callable[[Array], Array]) -> Array:
     """By what points (N, 3) seen from poses (N, 4, 4) move, in world coordinates (N, 3); not at all out of view."""
     R = T_world_left[:, :3, :3]
-    local = times_vectors(np.swapaxes(R, 1, 2), points - T_world_left[:, :3, 3])
-    z, _ = rig.project_stereo(local, jacobian=False)
-    seen = np.isfinite(z).all(axis=1) & rig.left.in_image(z[:, :2])
-    good = np.flatnonzero(seen & (np.abs(z[:, 0] - z[:, 2]) < rig.width))
-    corrected = correct(z[good])
-    shifts = np.zeros_like(points)
-    shifts[good] = times_vectors(R[good], rig.triangulate(corrected[:, :2], corrected[:, [2, 1]]) - local[good])
-    return np.nan_to_num(shifts)
+    z, J = rig.project_stereo(times_vectors(np.swapaxes(R, 1, 2), points - T_world_left[:, :3, 3]))
+    seen = np.isfinite(z).all(axis=1) & rig.left.in_image(z[:, :2]) & (np.abs(z[:, 0] - z[:, 2]) < rig.width)
+    good = np.flatnonzero(seen)
+    change = correct(z[good]) - z[good]
+    known = np.isfinite(change).all(axis=1) & (np.linalg.det(J[good]) != 0.0)  # else disparity is rounded off
+    good, change, shifts = good[known], change[known], np.zeros_like(points)
+    shifts[good] = times_vectors(R[good], np.linalg.solve(J[good], change[..., None])[..., 0])
+    return shifts
