@@ -14,7 +14,7 @@ from slam.chi_square import SIGMAS
 from slam.errors import ConfigurationError
 from slam.geometry.se3 import Array
 from slam.naming import unknown
-from slam.object_data import ObjectObservations
+from slam.object_data import ObjectEstimate, ObjectObservations
 
 ANYWHERE = 1e3  # numerics: standard deviation of an unknown position [m]
 
@@ -119,6 +119,22 @@ class ObjectModels:
             np.linalg.norm(velocity[3:]) <= self.max_speed
             and np.linalg.norm(velocity[:3]) <= self.max_turn_rate
             and change <= self.max_acceleration * dt + noise
+        )
+
+    def known(self, estimate: ObjectEstimate) -> bool:
+        """Whether an estimate of a body is more certain than these limits alone.
+
+        Standard deviations are compared: of the position with the largest distance covered in a second, of the
+        orientation with π, of the velocities with the largest ones.
+        """
+        P, V = estimate.covariance, estimate.velocity_covariance
+        rotation, position = np.trace(P[:3, :3]), np.trace(P[3:, 3:])
+        turning, speed = np.trace(V[:3, :3]), np.trace(V[3:, 3:])
+        return bool(
+            rotation <= math.pi**2
+            and position <= self.max_speed**2
+            and turning <= self.max_turn_rate**2
+            and speed <= self.max_speed**2
         )
 
 

@@ -24,8 +24,7 @@ class ObjectObservations:
     points: IdArray  # ids of its points (M,), unique over all bodies; a point keeps its id as long as it is tracked
     uv_left: Array  # left pixels (M, 2), finite
     uv_right: Array  # right pixels (M, 2), NaN where there is no stereo match
-    # pose (4, 4) at which a new body's frame is put; None: at the mean of its points
-    T_world_object: Array | None = None
+    T_world_object: Array  # pose (4, 4) at which a new body's frame is put
     velocity: Array | None = None  # prior [ω, v] (6,) of a new body in world axes [rad/s], [m/s]
     velocity_sigma: Array | None = None  # its standard deviations (6,); None where there is no prior
 

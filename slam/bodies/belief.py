@@ -16,7 +16,7 @@ import numpy as np
 from slam.bodies.config import CLEAR
 from slam.data import BoolArray, IdArray, RecentPoses
 from slam.geometry.arrays import Table
-from slam.geometry.se3 import Array, adjoint, transform
+from slam.geometry.se3 import Array, adjoint
 from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate
 from slam.window.marginal import marginalised
@@ -35,21 +35,6 @@ def compact(points: Array) -> BoolArray:
     """Which of the points (N, 3) lie near their median point."""
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1) if len(points) else np.zeros(0)
     return np.asarray(distance <= _FAR * np.median(distance) if len(points) else np.zeros(0, bool))
-
-
-def first_frame(T_world_left: Array, h: Array) -> tuple[Array, BoolArray]:
-    """The frame of a body seen for the first time: origin at the mean of its points, axes of the world.
-
-    Its points h (M, 3) are in camera coordinates, NaN without a depth. Which were taken (M,) is returned as well: false
-    stereo matches are not.
-    """
-    world = transform(T_world_left, h)
-    seen = np.isfinite(world).all(axis=1)
-    near = np.zeros(len(h), bool)
-    near[seen] = compact(world[seen])
-    T = np.eye(4)
-    T[:3, 3] = world[near].mean(axis=0)
-    return T, near
 
 
 def when_measured(probability: float, gain: float) -> float:

@@ -139,10 +139,8 @@ def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
     )  # fmt: skip
 
 
-def with_belief(body: Body, belief: BodyBelief | None, slot: int, stamp: float, min_speed: float) -> Body:
-    """The body as it is estimated in the present frame; as it was predicted where there is no estimate."""
-    if belief is None:
-        return replace(body, belief=None)
+def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_speed: float) -> Body:
+    """The body as it is estimated in the present frame."""
     estimate = belief.estimate
     size = 0.5 * float(np.linalg.norm(body.upper - body.lower))
     v, P = estimate.velocity, estimate.velocity_covariance

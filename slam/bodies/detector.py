@@ -25,7 +25,7 @@ from slam.bodies.estimator import FRAMES, BodyEstimator
 from slam.bodies.finder import Scene, parting
 from slam.bodies.fits import fit_positions, fit_velocities, record, revise_tracks
 from slam.bodies.following import follow, found_again, located, observed
-from slam.bodies.frame import NO_IDS, Frame, Setup, recent_poses, with_estimate
+from slam.bodies.frame import NO_IDS, Frame, OnlinePose, Setup, recent_poses
 from slam.bodies.membership import merge
 from slam.bodies.proof import Way, with_frame
 from slam.bodies.regions import Region, follow_regions
@@ -37,7 +37,6 @@ from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
 from slam.tracks.table import Tracks
 
-_NONE: IndexArray = np.zeros(0, np.intp)
 _FORGOTTEN = 8.0  # [s] after which an unseen body is forgotten
 
 
@@ -55,10 +54,9 @@ class ObjectDetector:
     def parting(
         self, tracks: Tracks, features: StereoFeatures, at: IndexArray, rows: IndexArray, T_world_left: Array
     ) -> IdArray:
-        """Ids of landmarks that may have begun to move in this frame or the last ones: see `suspects`.
+        """Ids of landmarks that may have begun to move: of those `at` rows of the table (K,), found as `rows` (K,).
 
-        The table is as the last frame left it; `at` are rows in it of the landmarks found in this frame (K,), and
-        `rows` those of their features (K,). The pose (4, 4) is that before the back end's update.
+        The table is as the last frame left it, the pose (4, 4) that before the back end's update.
         """
         return np.zeros(0, np.int64)
 
@@ -101,7 +99,7 @@ class MovingObjectDetector(ObjectDetector):
         self._stamps = np.full(window, np.nan)
         self._poses = np.tile(np.eye(4), (window, 1, 1))  # of the left camera in the window's frames
         self._number = -1
-        self._path: RecentPoses | None = None
+        self._path: list[OnlinePose] = []
         self._regions: list[Region] = []
 
     def revise(self, tracks: Tracks, correct: Callable[[Array], Array]) -> None:
@@ -124,7 +122,7 @@ class MovingObjectDetector(ObjectDetector):
 
     def step(
         self, recent: RecentPoses | None, tracks: Tracks, features: StereoFeatures, estimate: Estimate,
-        still: IndexArray = _NONE,
+        still: IndexArray = NO_IDS,
     ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
         """Follow all tracks into this frame, test them, and find bodies; see `ObjectDetector`."""
         frame = self._begin(recent, tracks, features, estimate)
@@ -146,7 +144,8 @@ class MovingObjectDetector(ObjectDetector):
             for region in moved:
                 self._found(finder.region_group(frame, tracks, region), tracks, frame, far=True)
         self._prove(tracks, frame, scenes)
-        unproven = (tracks.body >= 0) & ~self._of_proven(tracks)
+        proven = of_bodies(tracks, (body for body in self.bodies.values() if body.proven))
+        unproven = (tracks.body >= 0) & ~proven
         expelled = np.flatnonzero(tracks.expelled & tracks.found)
         # of a body that was dropped: nothing is known of these until a group could be found
         unproven[expelled[tracks.count(expelled) < MIN_FRAMES + RUN]] = True
@@ -154,7 +153,7 @@ class MovingObjectDetector(ObjectDetector):
         self.suspects = np.unique(suspected[suspected >= 0])
         self._begin_estimates(tracks, frame)
         self._begin_tracks(tracks, frame)
-        return self._motion_labels(tracks, frame), reported(self.bodies, tracks)
+        return self._motion_labels(tracks, frame, proven), reported(self.bodies, tracks)
 
     def _begin(self, recent: RecentPoses | None, tracks: Tracks, features: StereoFeatures, estimate: Estimate) -> Frame:
         """Move on by a frame; nothing is followed into the first one."""
@@ -167,12 +166,12 @@ class MovingObjectDetector(ObjectDetector):
         local = s.rig.triangulate(features.uv_left, features.uv_right)
         measured = among(len(local), tracks.row[tracks.row >= 0])
         measuring = local[measured & np.isfinite(local[:, 0])]
-        self._path = with_estimate(self._path, estimate, s.rig, s.sigma, measuring, FRAMES + 1)
-        cameras = recent_poses(recent, FRAMES + 1, self._path, estimate.covariance)
+        self._path = [*self._path[-FRAMES:], OnlinePose(s.rig, s.sigma, estimate, measuring)]
+        cameras = recent_poses(recent, self._path)
         return Frame(s, self._number, features, local, self._stamps.copy(), self._poses.copy(), cameras)
 
     def _advance_bodies(self, tracks: Tracks, frame: Frame) -> None:
-        """Predict all bodies; forget those that were not seen for long, or are gone before they were proven."""
+        """Predict all bodies; forget those not seen for long, and those gone before they were proven."""
         now, dt = frame.features.stamp, frame.dt
         for body in list(self.bodies.values()):
             if now - body.seen_at > _FORGOTTEN or (body.gone and not body.proven):
@@ -189,7 +188,7 @@ class MovingObjectDetector(ObjectDetector):
             tracks.position[mine] = transform(body.T, tracks.local[mine])
         for column in (tracks.A, tracks.p, tracks.dof):  # what the slot held leaves the window
             column[:, frame.slot] = 0
-        self._record(tracks, np.flatnonzero(tracks.found), frame)
+        record(tracks, np.flatnonzero(tracks.found), frame)
 
     def _estimated(self, body: Body, tracks: Tracks, frame: Frame) -> Body:
         """The body after this frame."""
@@ -201,11 +200,9 @@ class MovingObjectDetector(ObjectDetector):
         front = (b for b in self.bodies.values() if b.proven and not b.gone and b.id != body.id)
         tracks.row[mine[hidden(front, frame.eye, tracks.position[mine])]] = -1
         belief = located(body, tracks, frame, self._estimator)
+        if belief is None or not self.setup.models.known(belief.estimate):  # it begins anew once it is found again
+            return replace(body, belief=None)
         return with_belief(body, belief, slot, stamp, self.setup.config.min_speed)
-
-    def _record(self, tracks: Tracks, rows: IndexArray, frame: Frame) -> None:
-        """Add what tracks (K,) measured in this frame."""
-        record(tracks, rows, frame.slot, self.setup.rig, frame.T_world_left, frame.features, self.setup.sigma)
 
     def _fit(self, tracks: Tracks, frame: Frame) -> None:
         """Positions of free tracks, and velocities of those that may move."""
@@ -297,17 +294,13 @@ class MovingObjectDetector(ObjectDetector):
         numbers = np.arange(self._next_track, self._next_track + len(new))
         self._next_track += len(new)
         tracks.begin(new, numbers, f, transform(frame.T_world_left, frame.local[tracks.row[new]]))
-        self._record(tracks, new, frame)
+        record(tracks, new, frame)
         fit_positions(tracks, new)
 
-    def _of_proven(self, tracks: Tracks) -> BoolArray:
-        """Which tracks (N,) belong to a body that has moved for certain."""
-        return of_bodies(tracks, (body for body in self.bodies.values() if body.proven))
-
-    def _motion_labels(self, tracks: Tracks, frame: Frame) -> MotionLabels:
+    def _motion_labels(self, tracks: Tracks, frame: Frame, proven: BoolArray) -> MotionLabels:
         n = len(frame.local)
         on, near = membership.tracks_on_bodies(self.bodies, tracks)
         moving = among(n, tracks.row[on])
         undecided = among(n, np.append(tracks.row[near], tracks.row[tracks.found & tracks.doubtful]))
-        landmarks = np.sort(tracks.ids[self._of_proven(tracks) & (tracks.ids >= 0)])
+        landmarks = np.sort(tracks.ids[proven & (tracks.ids >= 0)])
         return MotionLabels(np.flatnonzero(moving), np.flatnonzero(undecided & ~moving), landmarks)

@@ -1,10 +1,9 @@
 """The estimate of a moving body: the camera in its last frames, moving among the body's points.
 
 Seen from the body it is the camera that moves: so a body is a window of camera poses in the body and of points, solved
-by `slam.window` as the camera's own window is. What ties the frames together besides the points is the body's motion,
-constant velocity in the world but for random impulses; there the camera's own motion comes in, with its uncertainty.
-Frames that leave are marginalised, so that a body that is seen for long does not drift. The camera's estimate is read
-and never changed.
+by `slam.window`. What ties the frames together besides the points is the body's motion, constant velocity in the world
+but for random impulses, by the camera's own motion with its uncertainty. Frames that leave are marginalised, so that a
+body that is seen for long does not drift. The camera's estimate is read and never changed.
 """
 
 from __future__ import annotations
@@ -14,15 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam.bodies.belief import (
-    BodyBelief,
-    Points,
-    begun,
-    carried,
-    first_frame,
-    slid,
-    window,
-)
+from slam.bodies.belief import BodyBelief, Points, begun, carried, compact, slid, window
 from slam.bodies.config import MIN_POINTS, RUN
 from slam.chi_square import chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, Observations, RecentPoses
@@ -93,12 +84,12 @@ class BodyEstimator:
         return after
 
     def _begun(self, id: int, seen: _Seen, cameras: RecentPoses) -> BodyBelief | None:
-        """A new belief: the body's frame is put where it is said to be, or at the mean of its points."""
-        X, stamp = cameras.poses[-1], float(cameras.stamps[-1])
-        own, near = first_frame(X, seen.local) if seen.deep.any() else (np.eye(4), seen.deep)
+        """A new belief: the body's frame is put where it is said to be. False stereo matches are left out."""
+        X, stamp, near = cameras.poses[-1], float(cameras.stamps[-1]), seen.deep.copy()
+        near[seen.deep] = compact(seen.local[seen.deep])
         if near.sum() < MINIMAL_POINTS:
             return None
-        T = own if seen.given.T_world_object is None else seen.given.T_world_object
+        T = seen.given.T_world_object
         velocity, sigmas = self.models.first_velocity(seen.given)
         none = np.zeros(0, np.int64)
         estimate = ObjectEstimate(

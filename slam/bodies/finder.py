@@ -9,15 +9,11 @@ says and the one that the rest says are compared with the covariance of both,
     (ξ_w − ξ_r)ᵀ (Λ_w⁻¹ + Λ_r⁻¹)⁻¹ (ξ_w − ξ_r)  ~  χ²(6),
 
 Λ being sums of ``Jᵀ W J`` over the tracks. The χ² of a track is ``dᵀ W d − 2 ηᵀ ξ + ξᵀ Λ ξ`` with ``η = Jᵀ W d``; J
-grows with the lag, so that ξ is a motion by frame. It matters if a body fills most of the near view: then the camera's
-estimated pose follows the body, and the still world seems to move.
+grows with the lag, so that ξ is a motion by frame.
 
-The test is made of all free tracks in the world, and of the tracks on a body in that body's axes, where what moves
-otherwise is a part of it: a lid on its hinge, for instance.
-
-A near body that starts to move would carry the camera along. So before each update the landmarks found in a frame are
-compared with where their tracks saw them. The camera keeps with the rest, which is wider spread, and the covariance of
-its pose grows by what the withheld measurements would have told.
+The test is made of all free tracks in the world; of the tracks on a body in that body's axes, where what moves
+otherwise is a part of it, such as a lid; and, before each update, of the landmarks found in a frame against where their
+tracks saw them: a near body that starts to move would carry the camera along.
 """
 
 from __future__ import annotations

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.bodies.bodies import Body
+from slam.bodies.frame import Frame
 from slam.bodies.track_kernels import constant_velocities, fit_fixed_points, points_on_rays
-from slam.data import IndexArray, StereoFeatures
+from slam.data import IndexArray
 from slam.geometry.rig import StereoRig, measurement_rows
 from slam.geometry.se3 import Array
 from slam.tracks.table import Tracks
@@ -31,14 +32,12 @@ def measure(rig: StereoRig, T_world_left: Array, points: Array, measured: Array,
     return found
 
 
-def record(
-    tracks: Tracks, rows: IndexArray, slot: int, rig: StereoRig, T_world_left: Array, features: StereoFeatures,
-    sigma: float,
-) -> None:  # fmt: skip
+def record(tracks: Tracks, rows: IndexArray, frame: Frame) -> None:
     """Enter what the features of tracks (K,) measure in this frame, in place."""
-    z = measurement_rows(features.uv_left[tracks.row[rows]], features.uv_right[tracks.row[rows]])
-    points, tracks.A[rows, slot], tracks.dof[rows, slot] = measure(rig, T_world_left, tracks.position[rows], z, sigma)
-    tracks.p[rows, slot] = points - tracks.anchor[rows]
+    f, slot, at, s = frame.features, frame.slot, tracks.row[rows], frame.setup
+    z = measurement_rows(f.uv_left[at], f.uv_right[at])
+    points, A, dof = measure(s.rig, frame.T_world_left, tracks.position[rows], z, s.sigma)
+    tracks.A[rows, slot], tracks.p[rows, slot], tracks.dof[rows, slot] = A, points - tracks.anchor[rows], dof
 
 
 def fit_positions(tracks: Tracks, rows: IndexArray) -> None:
@@ -105,11 +104,11 @@ def revise_tracks(
 def _shifts(points: Array, T_world_left: Array, rig: StereoRig, correct: Callable[[Array], Array]) -> Array:
     """By what points (N, 3) seen from poses (N, 4, 4) move, in world coordinates (N, 3); not at all out of view."""
     R = T_world_left[:, :3, :3]
-    local = times_vectors(np.swapaxes(R, 1, 2), points - T_world_left[:, :3, 3])
-    z, _ = rig.project_stereo(local, jacobian=False)
-    seen = np.isfinite(z).all(axis=1) & rig.left.in_image(z[:, :2])
-    good = np.flatnonzero(seen & (np.abs(z[:, 0] - z[:, 2]) < rig.width))
-    corrected = correct(z[good])
-    shifts = np.zeros_like(points)
-    shifts[good] = times_vectors(R[good], rig.triangulate(corrected[:, :2], corrected[:, [2, 1]]) - local[good])
-    return np.nan_to_num(shifts)
+    z, J = rig.project_stereo(times_vectors(np.swapaxes(R, 1, 2), points - T_world_left[:, :3, 3]))
+    seen = np.isfinite(z).all(axis=1) & rig.left.in_image(z[:, :2]) & (np.abs(z[:, 0] - z[:, 2]) < rig.width)
+    good = np.flatnonzero(seen)
+    change = correct(z[good]) - z[good]
+    known = np.isfinite(change).all(axis=1) & (np.linalg.det(J[good]) != 0.0)  # else disparity is rounded off
+    good, change, shifts = good[known], change[known], np.zeros_like(points)
+    shifts[good] = times_vectors(R[good], np.linalg.solve(J[good], change[..., None])[..., 0])
+    return shifts

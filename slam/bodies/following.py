@@ -15,7 +15,7 @@ from slam.bodies.frame import Frame
 from slam.bodies.track_kernels import inverses
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IndexArray, StereoFeatures
-from slam.geometry.arrays import among
+from slam.geometry.arrays import among, isin
 from slam.geometry.rig import measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.object_data import ObjectObservations
@@ -124,10 +124,10 @@ def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) 
     tracks.row[mine] = -1
     if belief is None or not belief.estimate.measured:
         return belief
-    agrees = np.isin(tracks.number[mine], belief.estimate.used)
+    agrees = isin(tracks.number[mine], belief.estimate.used)
     tracks.misfit[mine] = np.where(agrees, 0, tracks.misfit[mine] + 1)
     _take_from_free(tracks, rows[agrees])
-    left = agrees | ~np.isin(rows, tracks.row[tracks.found])
+    left = agrees | ~isin(rows, tracks.row[tracks.found])
     tracks.row[mine[left]] = rows[left]
     tracks.look[mine[agrees]] = frame.features.descriptors[rows[agrees]]
     return belief
@@ -158,7 +158,7 @@ def found_again(body: Body, tracks: Tracks, frame: Frame) -> Array | None:
 def _take_from_free(tracks: Tracks, features: IndexArray) -> None:
     """Features (K,) are a body's: free tracks that have them are given up, in place."""
     free = np.flatnonzero((tracks.body < 0) & tracks.found)
-    tracks.give_up(free[np.isin(tracks.row[free], features)])
+    tracks.give_up(free[isin(tracks.row[free], features)])
 
 
 def observed(body: Body, tracks: Tracks, mine: IndexArray, features: StereoFeatures) -> ObjectObservations:

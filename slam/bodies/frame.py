@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -104,36 +105,38 @@ class Frame:
 NO_IDS: IdArray = np.zeros(0, np.int64)  #: none
 
 
-def with_estimate(
-    path: RecentPoses | None, estimate: Estimate, rig: StereoRig, sigma: float, landmarks: Array, n: int
-) -> RecentPoses:
-    """The online poses of the last n frames, with the (6, 6) blocks of each frame's own noise.
+@dataclass(frozen=True, eq=False)
+class OnlinePose:
+    """The camera's pose in a frame as it was estimated then."""
 
-    That is what its `landmarks`, (M, 3) in camera coordinates, would leave uncertain if they were known.
-    """
-    J = (rig.project_stereo(landmarks)[1] @ points_by_pose(landmarks)).reshape(-1, 6)
-    own = np.linalg.inv(np.linalg.inv(estimate.covariance + 1e-12 * np.eye(6)) + J.T @ J / sigma**2)
-    stamps, poses, blocks = np.array([estimate.stamp]), estimate.T_world_left[None], own
-    if path is not None:
-        stamps, poses = np.append(path.stamps, stamps)[-n:], np.concatenate([path.poses, poses])[-n:]
-        blocks = block_diag(path.covariance, own)[-6 * n :, -6 * n :]
-    return RecentPoses(stamps, poses, blocks)
+    rig: StereoRig
+    sigma: float  # pixel noise [px]
+    estimate: Estimate
+    landmarks: Array  # that measured it, in camera coordinates (M, 3) [m]
+
+    @cached_property
+    def noise(self) -> Array:
+        """Covariance (6, 6) by the frame's own noise: what the landmarks would leave uncertain if they were known."""
+        J = (self.rig.project_stereo(self.landmarks)[1] @ points_by_pose(self.landmarks)).reshape(-1, 6)
+        return np.linalg.inv(np.linalg.inv(self.estimate.covariance + 1e-12 * np.eye(6)) + J.T @ J / self.sigma**2)
 
 
-def recent_poses(recent: RecentPoses | None, n: int, path: RecentPoses, covariance: Array) -> RecentPoses:
-    """The camera's last n poses as the back end gives them, or else by its online poses.
+def recent_poses(recent: RecentPoses | None, path: Sequence[OnlinePose]) -> RecentPoses:
+    """The camera's last poses as the back end gives them, or else by its online poses in as many frames.
 
     Over a few frames nearly all of an online pose's uncertainty is one error that they share: the place in the map. So
-    a pose is off by what the newest is off, carried along, and by the two frames' own noises (`with_estimate`). The
-    newest pose has just its covariance (6, 6). A back end that has corrected its past may give fewer poses for a while.
+    a pose is off by what the newest is off, carried along, and by the two frames' own noises. The newest pose has just
+    its covariance (6, 6). A back end that has corrected its past may give fewer poses for a while.
     """
     k = len(path)
-    if recent is not None and len(recent) >= min(n, k):
+    if recent is not None and len(recent) >= k:
         return recent
-    by_newest = adjoint(inverse(path.poses) @ path.poses[-1])  # of a common error, as each pose's perturbation
-    newest = path.covariance[-6:, -6:]
+    stamps = np.array([online.estimate.stamp for online in path])
+    poses = np.stack([online.estimate.T_world_left for online in path])
+    by_newest = adjoint(inverse(poses) @ poses[-1])  # of a common error, as each pose's perturbation
     stacked = by_newest.reshape(6 * k, 6)
-    P = stacked @ covariance @ stacked.T
-    earlier = stacked[:-6]
-    P[:-6, :-6] += earlier @ newest @ earlier.T + path.covariance[:-6, :-6]
-    return RecentPoses(path.stamps, path.poses, P)
+    P = stacked @ path[-1].estimate.covariance @ stacked.T
+    if k > 1:
+        earlier = stacked[:-6]
+        P[:-6, :-6] += earlier @ path[-1].noise @ earlier.T + block_diag(*(online.noise for online in path[:-1]))
+    return RecentPoses(stamps, poses, P)

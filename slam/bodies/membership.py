@@ -27,7 +27,6 @@ MARGIN = 0.25  # how far from a body's extent its further features may lie, as a
 _OFF = 0.2  # how far a pose may be from a constant velocity, before anything is known [rad] and [m]
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join
 _LOOSE = 4.0  # times the 99 % limit that the χ² of a member may be whose motion is explained for the most part
-_UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
 _DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
 
 
@@ -212,8 +211,7 @@ def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body 
 def distinctness(one: Body, ones: IndexArray, other: Body, others: IndexArray, tracks: Tracks) -> float:
     """How far tracks of two bodies are from having moved like one rigid body; from 1 on they have not.
 
-    The increase of χ² if all share the poses of one, relative to the larger of its 99 % limit and that of motions that
-    differ by the share `_UNLIKE`, since errors of stereo are correlated over successive frames.
+    The increase of χ² if all share the poses of one, relative to its 99 % limit.
     """
     both = one.known & other.known
     one, other = replace(one, known=both), replace(other, known=both)
@@ -223,9 +221,7 @@ def distinctness(one: Body, ones: IndexArray, other: Body, others: IndexArray, t
 
     every = np.concatenate([ones, others])
     more = left(one, every) - left(one, ones) - left(other, others)
-    _, _, known = in_body_axes(one, tracks, every)
-    still = float(_still(tracks, every, known).sum())
-    return more / max(chi_square_limit(6 * max(int(both.sum()), 1), 0.99), _UNLIKE**2 * still)
+    return more / chi_square_limit(6 * max(int(both.sum()), 1), 0.99)
 
 
 def _distances(body: Body, tracks: Tracks, rows: IndexArray, margin: float) -> Array:

@@ -13,8 +13,8 @@ the camera moves. Therefore the body's places in the frames of the window, or th
 better than they scatter about it (an F test): a junction jumps, and it does not turn as a whole. What the way has in
 common with that of the camera says nothing: with a wrong disparity the place goes a share of the camera's way.
 
-Along a repeated pattern matches in the right image can be wrong for all members alike, by a disparity that changes with
-the view. Their way does not tell. But such features find no match in the right image in half of their frames.
+Along a repeated pattern right matches can be wrong for all members alike, by a disparity that changes with the view.
+Their way does not tell, but such features find no right match in half of their frames.
 """
 
 from __future__ import annotations

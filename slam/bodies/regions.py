@@ -1,10 +1,9 @@
 """Regions that may be a moving body: neighbouring tracks with agreeing velocities, followed over time.
 
-A body that shows few tracks at a time, and each for a few frames only (a cyclist, a distant car), never has as many
-long tracks as `slam.bodies.finder` needs. Here the region is followed instead of its tracks: tracks come and go, the
-region's place and velocity stay in a Kalman filter with constant velocity. A region that is followed over more than its
-own size by tracks that move as it does is hardly still: where velocities are wrong (false matches, depth noise) the
-region walks away from the tracks that made it.
+A body that shows few tracks at a time, each for a few frames (a cyclist, a distant car), never has as many long tracks
+as `slam.bodies.finder` needs. Its region's place and velocity stay in a Kalman filter with constant velocity while
+tracks come and go. A region that is followed over more than its own size is hardly still: where velocities are wrong
+(false matches, depth noise) it walks away from the tracks that made it.
 """
 
 from __future__ import annotations

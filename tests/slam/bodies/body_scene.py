@@ -10,7 +10,7 @@ import numpy as np
 import backends
 from slam.bodies.belief import BodyBelief
 from slam.bodies.estimator import FRAMES, BodyEstimator
-from slam.bodies.frame import recent_poses, with_estimate
+from slam.bodies.frame import OnlinePose, recent_poses
 from slam.data import Observations
 from slam.evaluation.metrics import nees
 from slam.geometry import se3
@@ -58,12 +58,14 @@ class BodyScene:
 
     def observations(self, k: int, rng: np.random.Generator, outliers: float = 0.0) -> ObjectObservations:
         """The body in frame k; a share of its points is measured elsewhere on it, or with a wrong right pixel."""
-        uv, seen = self._seen(k, se3.transform(self.body[k], self.points), rng)
+        points = se3.transform(self.body[k], self.points)
+        uv, seen = self._seen(k, points, rng)
         bad = rng.random(len(uv)) < outliers
         offsets = rng.uniform(5, 30, (len(uv), 3)) * rng.choice([-1, 1], (len(uv), 3))
         uv[bad] += offsets[bad][:, [0, 1, 2, 1]]
         rows = np.flatnonzero(seen)
-        return ObjectObservations(7, rows + 1000, uv[rows, :2], uv[rows, 2:])
+        T = se3.pose(np.eye(3), points.mean(axis=0))
+        return ObjectObservations(7, rows + 1000, uv[rows, :2], uv[rows, 2:], T)
 
     def _seen(self, k: int, points: Array, rng: np.random.Generator) -> tuple[Array, Array]:
         """Noisy (uL, vL, uR, vR) of points in frame k; on the right the row has the noise of the left one."""
@@ -167,7 +169,7 @@ def follow(
     `rule` may change what is observed of the body in a frame, or take it away (None).
     """
     backend, estimator = backends.create(name, scene.rig, models=scene.models), BodyEstimator(scene.rig, scene.models)
-    rng, known, belief, path = np.random.default_rng([seed, 7]), set(), None, None
+    rng, known, belief, path = np.random.default_rng([seed, 7]), set(), None, []
     for k, stamp in enumerate(scene.stamps):
         backend.predict(float(stamp))
         seen = scene.background(k, rng)
@@ -175,11 +177,11 @@ def follow(
         backend.update(seen.select(old))
         local = scene.rig.triangulate(seen.uv_left, seen.uv_right)
         deep, e = np.isfinite(local).all(axis=1), backend.estimate(landmarks=False)
-        path = with_estimate(path, e, scene.rig, SIGMA, local[old & deep], FRAMES + 1)
+        path = [*path[-FRAMES:], OnlinePose(scene.rig, SIGMA, e, local[old & deep])]
         given = scene.observations(k, rng, outliers if k else 0.0)
         given = given if rule is None else rule(k, given)
         recent = backend.recent(FRAMES + 1) if isinstance(backend, RecentBackend) else None
-        belief = estimator.updated(belief, 7, given, recent_poses(recent, FRAMES + 1, path, e.covariance))
+        belief = estimator.updated(belief, 7, given, recent_poses(recent, path))
         if belief is not None:
             yield k, belief, e.T_world_left
         backend.add(seen.select(~old & deep))

@@ -8,7 +8,6 @@ import pytest
 import slam
 from slam.bodies.config import WINDOW, ObjectsConfig
 from slam.config import SystemConfig
-from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
 from slam.evaluation.objects import score_for
 from slam.geometry.se3 import inverse, transform
@@ -110,16 +109,6 @@ def test_members_are_predicted_where_they_are_seen():
                 off += list(np.linalg.norm(z[:, :2] - features.uv_left[tracks.row[mine]], axis=1))
     assert len(off) > 100
     assert np.median(off) < 2.0  # noise of 0.7 px in both coordinates: 0.8 px
-
-
-def test_frames_with_nothing_to_see_are_no_error():
-    sequence = slam.open_sequence("synthetic:desk?frames=8")
-    system = system_for(sequence)
-    for k in range(8):
-        features = sequence.observations(k)
-        if k in (0, 3, 4):
-            features = StereoFeatures.empty(features.stamp, features.descriptors.shape[1])
-        assert not len(system.process_features(features).moving_features)
 
 
 def test_off_detects_nothing():

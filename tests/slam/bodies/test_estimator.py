@@ -12,11 +12,12 @@ from scipy.optimize import least_squares
 import backends
 from slam.bodies.belief import slid
 from slam.bodies.estimator import FRAMES, BodyEstimator
-from slam.bodies.frame import recent_poses, with_estimate
+from slam.bodies.frame import OnlinePose, recent_poses
 from slam.data import Observations, RecentPoses
 from slam.evaluation.metrics import chi_square_band
 from slam.geometry import se3
 from slam.models import ObjectModels
+from slam.object_data import ObjectEstimate
 from slam.window.problem import Motion
 from slam.window.stereo import RectifiedStereo
 from tests.slam.bodies.body_scene import SIGMA, box_scene, car_scene, follow, score
@@ -254,18 +255,20 @@ def test_too_few_points_begin_no_body():
 def test_derived_recent_poses():
     """The newest pose has its own covariance; an increment has the noise of two frames, whatever is shared."""
     scene, rng = box_scene(seed=2, frames=FRAMES), np.random.default_rng(0)
-    backend, path, known = backends.create("batch", scene.rig, models=scene.models), None, set()
+    backend, path, known = backends.create("batch", scene.rig, models=scene.models), [], set()
     for k, stamp in enumerate(scene.stamps):
         backend.predict(float(stamp))
         seen = scene.background(k, rng)
         old = np.array([i in known for i in seen.ids.tolist()], bool)
         backend.update(seen.select(old))
         e, local = backend.estimate(landmarks=False), scene.rig.triangulate(seen.uv_left, seen.uv_right)
-        path = with_estimate(path, e, scene.rig, SIGMA, local[old], 3)
+        path = [*path[-2:], OnlinePose(scene.rig, SIGMA, e, local[old])]
         backend.add(seen.select(~old))
         known.update(seen.ids.tolist())
     wide = e.covariance + np.diag([0, 0, 0, 1.0, 1, 1])
-    recent = recent_poses(None, 3, path, wide)  # a back end without `recent`
+    recent = recent_poses(
+        None, [*path[:-1], replace(path[-1], estimate=replace(e, covariance=wide))]
+    )  # a back end without `recent`
     assert len(recent) == 3 and recent.stamps[-1] == scene.stamps[-1]
     assert recent.covariance[-6:, -6:] == pytest.approx(wide)
     J = np.concatenate([-se3.adjoint(se3.inverse(recent.poses[2]) @ recent.poses[1]), np.eye(6)], axis=1)
@@ -285,3 +288,11 @@ def test_what_a_body_can_do():
     assert not models.possible(fast, known, still, known, 0.1)
     assert models.possible(fast, known, still, known, 0.2)
     assert models.possible(fast, known, still, 0.1 * np.eye(6), 0.1)  # it may have been that fast before
+    none = np.zeros(0, np.int64)
+
+    def estimate(P, V):
+        return ObjectEstimate(1, 0.0, np.eye(4), P, np.zeros(6), V, True, none, none)
+
+    assert models.known(estimate(known, known))
+    assert not models.known(estimate(np.diag([1, 1, 1, 4, 4, 4.0]), known))
+    assert not models.known(estimate(known, np.full((6, 6), np.nan)))

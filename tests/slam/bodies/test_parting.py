@@ -10,6 +10,7 @@ from frontends import create
 from slam.bodies.config import WINDOW, ObjectsConfig
 from slam.bodies.detector import MovingObjectDetector
 from slam.bodies.fits import fit_positions, record
+from slam.bodies.frame import Frame
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry.se3 import exp, inverse, log
@@ -20,6 +21,7 @@ from tests.slam.scene import RIG
 SIGMA = 0.3  # pixel noise [px]; the detector is told one pixel
 FRAMES = WINDOW
 IDENTITY = np.eye(4)
+TIMES, POSES = np.zeros(WINDOW), np.tile(IDENTITY, (WINDOW, 1, 1))
 
 
 def seen(points, rng):
@@ -58,7 +60,8 @@ class Room:
         tracks.begin(self.ids, self.ids, features_at(np.zeros((count, 3))), self.points)
         for frame in range(frames):
             known = self.ids[(self.ids != near - 1) | (frame > frames - 3)]
-            record(tracks, known, frame, RIG, IDENTITY, features_at(seen(self.points, rng)), 1.0)
+            features = features_at(seen(self.points, rng))
+            record(tracks, known, Frame(self.detector.setup, frame, features, self.points, TIMES, POSES, None))
         fit_positions(tracks, self.ids)
         self.detector._number = frames - 1
 

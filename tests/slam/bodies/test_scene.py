@@ -44,11 +44,6 @@ def test_the_near_group_is_found_though_the_pose_is_wrong(pose_error):
     assert abs(found.groups[0].away - 0.006) < 0.002
 
 
-def test_too_few_tracks_say_nothing():
-    moved, view = scene(count=8, near=4, shift=(0.1, 0, 0))
-    assert not classify_scene(moved, view, 30.0).groups
-
-
 def test_single_false_tracks_find_no_company():
     """Three tracks that jumped, each its own way: no window holds enough that moved alike."""
     moved, view = scene()
