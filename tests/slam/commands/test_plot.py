@@ -37,10 +37,12 @@ def test_a_path_that_is_one_dot_is_drawn_without_a_word(tmp_path, caplog):
 
 def test_a_true_path_is_drawn_where_all_runs_have_the_same(finished):
     truth = finished.truth
-    apart, late = Trajectory(truth.stamps, truth.poses @ exp(np.ones(6))), Trajectory(truth.stamps + 9, truth.poses)
-    for other, same in ((truth, True), (truth.select(np.arange(3)), True), (apart, False), (late, False)):
+    elsewhere = replace(finished, truth=Trajectory(truth.stamps, truth.poses @ exp(np.ones(6))))
+    later = {name: Trajectory(truth.stamps + 9, getattr(finished, name).poses) for name in ("online", "truth")}
+    part = replace(finished, truth=truth.select(np.arange(3)))
+    for other, same in ((finished, True), (part, True), (elsewhere, False), (replace(finished, **later), False)):
         axis = Figure().subplots()
-        draw_paths(axis, [finished, replace(finished, name="b", truth=other)])
+        draw_paths(axis, [finished, other])
         labels = [text.get_text() for text in axis.get_legend().get_texts()]
         assert ("true path" in labels) == same == ("true paths differ" not in axis.get_title())
 
