@@ -321,7 +321,7 @@ class FrameStatus(StrEnum):
     """How a frame ended.
 
     STARTED: the map begins, with the first frame that shows anything. TRACKED: the pose was measured against the map.
-    PREDICTED, FAILED: too few matches, or they have no solution: the pose is the motion model's. LOST: so for long.
+    Else it is the motion model's. PREDICTED: too few matches. LOST: too few for several frames. FAILED: no solution.
     """
 
     STARTED = "started"

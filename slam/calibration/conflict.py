@@ -30,7 +30,7 @@ def conflict(model: RigModel, covariance: Array, evidence: Evidence, which: str 
     parameters less the prior's mean. A focal length is named from the gain `focal` on, other causes from `GAIN`.
     `which` says which calibration it is: "kept ", or nothing.
     """
-    whose, found = f"{which}calibration", dict[str, float]()  # gains by causes in words
+    whose = f"{which}calibration"
     information = np.linalg.inv(covariance)
     posterior = np.linalg.inv(information + evidence.S)
     pull, held = information @ (posterior @ evidence.e), information - information @ posterior @ information
@@ -43,24 +43,25 @@ def conflict(model: RigModel, covariance: Array, evidence: Evidence, which: str 
 
     gain, (share,) = freed(FOCALS)
     much = f"at least {abs(100 * share):.0f} % {'shorter' if share > 0 else 'longer'} than the {whose}'s"
-    of_focal = f"the images fit a focal length {much}: is it of this camera, and for images of this size?"
-    found[of_focal] = gain
+    cause = "is it of this camera, and for images of this size?"
+    causes = [(gain, focal, f"the images fit a focal length {much}: {cause}")]  # gain, from which on it is named, words
     gain, (k1, _) = freed(("left_k1", "right_k1"), ("left_k2", "right_k2"))
     cause = "are its coefficients of this camera, in this order and of this model?"
     if not (model.rig.left.has_distortion or model.rig.right.has_distortion):
         cause = "were the coefficients left out?"
-    found[f"the images show a lens distortion that is not in the {whose} (k1 about {-k1:+.2f}): {cause}"] = gain
+    much = f"that is not in the {whose} (k1 about {-k1:+.2f})"
+    causes.append((gain, GAIN, f"the images show a lens distortion {much}: {cause}"))
     gain, shift = freed(("left_cx", "right_cx"), ("left_cy", "right_cy"))
     much = f"about {model.focal * np.linalg.norm(shift):.0f} px from the {whose}'s"
     cause = "were they cropped, or is it for images of another size?"
-    found[f"the images fit a principal point {much}: {cause}"] = gain
+    causes.append((gain, GAIN, f"the images fit a principal point {much}: {cause}"))
     gain, (offset,) = freed(("right_cx",))
     much = f"about {abs(model.focal * offset):.1f} px off the {whose}'s"
     cause = "was the right image cropped or shifted, or a camera turned since?"
-    found[f"the images fit disparities {much}: {cause}"] = gain
+    causes.append((gain, GAIN, f"the images fit disparities {much}: {cause}"))
     gain, turn = freed(("pitch",), ("roll",))
     much = f"turned by about {np.degrees(np.linalg.norm(turn)):.1f}° against the {whose}'s"
     cause = "was a camera moved since, or is its rotation the inverse one?"
-    found[f"the images fit a right camera that is {much}: {cause}"] = gain
-    enough = [words for words, gain in found.items() if gain > (focal if words == of_focal else GAIN)]
-    return max(enough, key=lambda words: found[words], default="")
+    causes.append((gain, GAIN, f"the images fit a right camera that is {much}: {cause}"))
+    _, named = max(((gain, words) for gain, least, words in causes if gain > least), default=(0.0, ""))
+    return named

@@ -45,6 +45,7 @@ from slam.geometry.se3 import Array, adjoint
 from slam.interfaces import Backend, ConsideringBackend, RevisingBackend
 from slam.tracks.follow import Matches
 
+_BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: within a block of so many, errors are taken to be correlated
 _MOST_FEATURES = 1000  # cost: of a view, the strongest ones; half of the usual 800 made drives worse by a half
 
 #: Change of the correction, in standard deviations of the disparities' error, for a back end to revise its past.
@@ -84,8 +85,8 @@ class SelfCalibration:
         # covariance (n, n) of its mean by what its evidence has in common: a systematic error, unknown residual fields
         self._by_bias = np.zeros_like(start)
         self._before = np.linalg.inv(start)  # information (n, n) without evidence
-        # 8, 4: frames, pairs, within a block of which errors are taken to be correlated
-        self._rows, self._motion = Accumulator(config.inflation, 8), Accumulator(config.inflation, 4)
+        self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
+        self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
         self._fields: Evidence | None = None  # of rows: parameters and residual fields
         self._far = self.model.field(self.model.far())[:, 2]  # disparities of far points by the parameters
         self._focal = along(self.model, *FOCALS) / 2  # the focal lengths' common error by the parameters

@@ -45,6 +45,13 @@ FOCAL = 0.005
 #: The parameters that such an error changes.
 FOCALS = "left_f", "right_f"
 
+_MEAN_DISPARITY = 7e-4  # of far points over the image, as a chess board leaves it [focal lengths]
+_MEAN_ROW = 1.4e-3  # the same of their rows
+#: Root mean square over the image of either [focal lengths]: about a pixel at a focal length of 700 px, as reprojection
+#: errors would show larger ones.
+_FIELD = 1.4e-3
+_FIELD_VALUES = 10  # independent ones of such errors, which change smoothly over the image
+
 _OFFSETS = (0.03, 0.3, 1.0)  # scales of an offset of the disparity alone, equally probable a priori
 
 
@@ -249,13 +256,10 @@ def prior_information(model: RigModel) -> Array:
     information = np.diag(sigmas**-2)
     far = model.far()
     field = model.field(far) / model.focal
-    # 7e-4, 1.4e-3: a chess board bounds the means over the image of far points' disparities and rows [focal lengths]
-    for change, sigma in ((field[:, 2], 7e-4), (field[:, 3], 1.4e-3)):
+    for change, sigma in ((field[:, 2], _MEAN_DISPARITY), (field[:, 3], _MEAN_ROW)):
         mean = change.mean(axis=0)
         information += np.outer(mean, mean) / sigma**2
-        # 1.4e-3: and their root mean square: about a pixel at a focal length of 700 px, as reprojection errors would
-        # show larger ones. 10: such fields are smooth, so they have some ten independent values
-        information += change.T @ change * (10 / (len(far) * 1.4e-3**2))
+        information += change.T @ change * (_FIELD_VALUES / (len(far) * _FIELD**2))
     return np.asarray(information)
 
 

@@ -17,7 +17,7 @@ from slam.errors import ConfigurationError
 from slam.files import noting_inputs
 from slam.naming import count as count_of
 from slam.run.calibrating import calibrate as run
-from slam.sequences import open_sequence
+from slam.sequences import is_live, open_sequence
 from slam.settings import require_settable
 
 _SIGN = (
@@ -46,7 +46,7 @@ def calibrate(
     with noting_inputs() as inputs:
         opened = [open_sequence(text, format=format) for text in texts]
     count = sum(frame_count(sequence, *frames) or 0 for sequence in opened)
-    if not quiet:
+    if not (quiet or any(map(is_live, opened))):  # a camera is refused
         print(f"{count_of(len(opened), 'recording')}, {count} frames: each is run once, then what they say is added up")
     with progress(count, "calibrate", quiet) as tell:
         found = run(opened, out, settings, frames, inputs, overwrite, tell)

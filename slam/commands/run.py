@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,8 @@ from slam.run.summary import RunRecord
 from slam.run.warm_up import compile_kernels
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import format_of, is_live, open_sequence
+from slam.sequences.folders import VIDEO_SUFFIXES
+from slam.sequences.images import IMAGE_SUFFIXES
 from slam.settings import require_settable
 
 _BACKEND, _FRONTEND = "ekf", "surf"
@@ -186,7 +188,13 @@ def run_folder(out: Path | None, sequence: str, backend: str) -> Iterator[Path]:
 
 def require_no_recording(out: Path) -> None:
     """Raise SlamError where the folder of a run or a comparison is that of a recording."""
-    if (found := format_of(out)) is not None:
+    found = format_of(out)
+    if found == "folders":  # as is each with a folder called left or right, also of a run
+        files = chain(out.glob("*"), out.glob("*/*"))
+        shown = (path for path in files if path.suffix.lower() in IMAGE_SUFFIXES | VIDEO_SUFFIXES)
+        if all((path.parent / "summary.json").exists() for path in shown):
+            return
+    if found is not None:
         raise SlamError(f"{out}: holds a recording (format {found}); give another --out")
 
 

@@ -69,10 +69,11 @@ class Group:
         return np.array([run.metrics.get(key, np.nan) for run in self.runs[backend]], float)
 
     def mean_and_sd(self, backend: str, metric: Metric) -> tuple[float, float]:
-        """`mean_of` a figure and its standard deviation over the runs that have it; NaN where unknown."""
+        """`mean_of` a figure and the standard deviation about it of the runs that have it; NaN where unknown."""
         values = self.values(backend, metric.key)
         values = values[np.isfinite(values)]
-        return mean_of(metric, values), float(values.std(ddof=1)) if len(values) > 1 else float("nan")
+        mean, spare = mean_of(metric, values), len(values) - 1
+        return mean, float(np.sqrt(np.square(values - mean).sum() / spare)) if spare > 0 else float("nan")
 
     @property
     def first_metrics(self) -> list[Metric]:

@@ -110,15 +110,10 @@ def stretch_nees(
     common = common or [CommonError()] * len(own)
     noises = covariances - np.array([one.covariance for one in common])
     earlier, At = A @ noises[first], np.swapaxes(A, 1, 2)
-    told = np.full_like(earlier, np.nan) if joint is None else joint.between(first, last)
-    shared = np.where(np.isfinite(told), told, earlier) @ At
-    N = (
-        noises[last]
-        + earlier @ At
-        - shared
-        - np.swapaxes(shared, 1, 2)
-        + truth_covariances(true, noise, first, last, A)
-    )
+    given = np.full_like(earlier, np.nan) if joint is None else joint.between(first, last)  # by the back end
+    shared = np.where(np.isfinite(given), given, earlier) @ At
+    N = noises[last] + earlier @ At - shared - np.swapaxes(shared, 1, 2)
+    N = N + truth_covariances(true, noise, first, last, A)
     N, G = _shared(A, [(common[i], common[j]) for i, j in zip(first, last)], N)
     N = 0.5 * (N + np.swapaxes(N, 1, 2))
     usable = np.isfinite(residuals).all(axis=1) & ~doubtful(true, noise, first, last)

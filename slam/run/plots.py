@@ -19,7 +19,8 @@ import numpy as np
 from slam.errors import ConfigurationError, SlamError
 from slam.files import noting_inputs, whole_file
 from slam.geometry.se3 import Array, inverse, transform
-from slam.geometry.trajectory import TruthNoise
+from slam.geometry.stamps import pair
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.naming import unknown
 from slam.outputs import Output, require_outputs
 from slam.run.results import facts, number
@@ -181,14 +182,16 @@ def _coloured(runs: Sequence[RunData]) -> list[tuple[RunData, str, float]]:
 
 
 def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
-    """The paths, in the world of the first run that has a truth, and the true one.
+    """The paths, in the world of the first run that has a truth, and the true one, where all have the same.
 
     From above, or from the side where the camera moves most up and down.
     """
     first = next((run for run in runs if run.truth is not None), None)
     paths: dict[str, list[Array]] = {}
     to_first = np.eye(4) if first is None else place_of_truth(first)
-    truth = None if first is None or first.truth is None else (to_first @ first.truth.poses)[:, :3, 3]
+    truths = [run.truth for run in runs if run.truth is not None]
+    differ = not all(_agree(truths[0], other) for other in truths[1:])
+    truth = (to_first @ truths[0].poses)[:, :3, 3] if truths and not differ else None
     for run in runs:
         T = np.eye(4) if run.truth is None or run is first else to_first @ inverse(place_of_truth(run))
         paths[run.name] = [(T @ path.poses)[:, :3, 3] for path in (run.online, run.final)]
@@ -210,7 +213,7 @@ def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
             axis.plot(*final.T, ":", color=colour, lw=1.5, label=f"{run.name}, final")
     across, ahead = (f"{('right', 'up', 'forward')[k]} [{unit}]" for k in shown)
     view = "above" if shown[1] == 2 else "the side"
-    title = f"Path from {view}, online (dot: start)"
+    title = f"Path from {view}, online (dot: start){'; true paths differ' if differ else ''}"
     if not any(run.measured[1:].any() for run in runs):
         title = "No path: no frame after the first was tracked"
     elif extent.max() < _STANDS:
@@ -223,6 +226,13 @@ def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
     axis.legend(framealpha=0.8)
     axis.locator_params(axis="x", nbins=6)
     axis.grid(color="0.9", lw=0.5)
+
+
+def _agree(one: Trajectory, other: Trajectory) -> bool:
+    """Whether two true paths have stamps in common, and the same positions then."""
+    rows = pair(one.stamps, other.stamps, 1e-6)
+    both = rows >= 0
+    return bool(both.any()) and np.allclose(one.positions[both], other.positions[rows[both]], atol=1e-6)
 
 
 def _unit(largest: float) -> tuple[float, str]:

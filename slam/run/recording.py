@@ -86,10 +86,8 @@ def load_recording(path: str | Path) -> Recording:
     content = read_bytes(path, _LARGEST, expected="a recording, which `slam run --record FILE.npz` leaves")
     if content.startswith(b"surf-stereo-slam map"):
         raise SequenceError(f"{path}: a saved map, which a run starts in with --map, no recording")
-    arrays = unpack(content, str(path), ("header", *_ARRAYS), SequenceError)
+    arrays = unpack(content, str(path), error=SequenceError)
     try:
-        kinds = _ARRAYS | {name: kind for name, kind in _OPTIONAL.items() if name in arrays}
-        require_arrays(arrays, kinds, "recording", SequenceError)
         return _recording(arrays)
     except KeyError as error:
         raise SequenceError(f"{path}: the recording lacks {error.args[0]!r}") from error
@@ -98,11 +96,13 @@ def load_recording(path: str | Path) -> Recording:
 
 
 def _recording(arrays: dict[str, np.ndarray]) -> Recording:
-    header = json_text(str(arrays["header"]), "header", SequenceError)
+    header = json_text(str(arrays.get("header", "{}")), "header", SequenceError)
     if not isinstance(header, dict) or header.get("format") != _HEADER["format"]:
-        raise SequenceError("is no recording of this version")
+        raise SequenceError("is no recording")
     if header["version"] != _HEADER["version"]:
         raise SequenceError(f"is a recording of version {header['version']}; this one reads {_HEADER['version']}")
+    kinds = _ARRAYS | {name: kind for name, kind in _OPTIONAL.items() if name in arrays}
+    require_arrays(arrays, kinds, "recording", SequenceError)
     tree, models = header["rig"], header["models"]
     left, right = (PinholeCamera(**{**tree[s], "distortion": tuple(tree[s]["distortion"])}) for s in ("left", "right"))
     rig = StereoRig(left, right, np.array(tree["R"], float), np.array(tree["b"], float))

@@ -15,6 +15,7 @@ import numpy as np
 from slam.evaluation.consistency import BEFORE, EXACT, PIXELS_ALONE
 from slam.evaluation.metrics import chi_square_band
 from slam.naming import count
+from slam.sequences import formats
 
 _SCALES = {"mm": 1e3, "%": 100.0}  # units in which people see metres and shares
 
@@ -266,7 +267,8 @@ def verdict_of_run(summary: Mapping[str, Any]) -> str:
         return f"covariances cannot be judged: {why}"
     if truth := errors_of_truth(summary):
         text += f"; errors of the true path itself that are counted: {truth}"
-        text += "" if any(summary["truth"].values()) else " (truth_sigma= gives it some)"
+        if not any(summary["truth"].values()) and summary["format"] in formats():  # then it is by truth=
+            text += " (truth_sigma= gives it some)"
     if doubtful:
         over, share = next(iter(doubtful.items()))
         text += f"; not judged: {100 * share:.0f} % of the stretches {over}, where the true path is doubtful"

@@ -129,7 +129,7 @@ def results_of(
     noise, doubt = getattr(sequence, "truth_noise", TruthNoise()), ""
     of_camera = sequence.format != "synthetic" and not noise.mounting  # in a file of the camera's own poses
     if sequence.ground_truth is not None and of_camera and not getattr(system, "doubt", ""):  # else nothing tells it
-        doubt = truth_doubt(online, sequence.ground_truth, noise.translation)
+        doubt = truth_doubt(online, sequence.ground_truth, noise)
     if doubt:
         logger.warning("%s", doubt)
     speeds = np.linalg.norm(steps, axis=1) / np.diff(path.stamps)

@@ -15,7 +15,7 @@ import numpy as np
 from slam.errors import TrajectoryError
 from slam.evaluation.metrics import absolute_errors, associate
 from slam.geometry.se3 import Array, inverse, nearest_rotation, pose, quaternion, rotation_from_quaternion, so3_log
-from slam.geometry.trajectory import Trajectory
+from slam.geometry.trajectory import Trajectory, TruthNoise
 
 _SECONDS = 1.0  # over which motions are compared
 _LEAST = 10  # guard: motions to judge by
@@ -28,6 +28,8 @@ _FINE = 0.01  # errors of motions, as a share of them, below which nothing is lo
 _MISFIT = 0.3  # errors of motions, as a share of them, that are no drift
 _APART = 0.8  # the same, that no noise of an estimated path explains
 _ALIKE = 0.05  # errors of positions, as a share of the path, that are drift
+_POSES = 6**0.5  # by which errors of a motion exceed those of an axis: two poses, of three axes each
+_EXACT = TruthNoise()
 _ROUNDS = 8  # of the fit
 _LEVER_PRIOR = 1e-4  # [rad²] of turns that tell no lever
 _UNITS = {"mm": 1000.0, "cm": 100.0, "inches": 39.37, "feet": 3.281, "km": 0.001}
@@ -43,15 +45,16 @@ class _Fit(NamedTuple):
     lever: float  # its distance from the camera [m]
     motions: int
     size: float = 1.0  # of the estimated ones [m], root mean square
+    turning: float = 1.0  # the same of their rotations [rad]
 
 
-def truth_doubt(own: Trajectory, truth: Trajectory, sigma: float = 0.0) -> str:
+def truth_doubt(own: Trajectory, truth: Trajectory, noise: TruthNoise = _EXACT) -> str:
     """Why covariances cannot be judged by a true path, in a line: it looks wrong, or is of another scale.
 
     Args:
         own: the estimated path, of measured poses.
         truth: the true path as it was given, at stamps of its own.
-        sigma: of each of its coordinates [m]; what that explains is no mistake.
+        noise: its errors; what its translation and rotation explain is no mistake.
 
     Returns:
         the line, empty where the paths agree or too little is known.
@@ -59,7 +62,10 @@ def truth_doubt(own: Trajectory, truth: Trajectory, sigma: float = 0.0) -> str:
     if len(own) > _ROWS:
         own = own.select(np.linspace(0, len(own) - 1, _ROWS).astype(int))
     given = _fit(own, truth, 0.0, free="")
-    if given is None or given.error < _EXPLAINS * max(_FINE, sigma / given.size):  # errors are no less than _FINE
+    if given is None:
+        return ""
+    known = _POSES * np.hypot(noise.translation / given.size, noise.rotation / given.turning)
+    if given.error < _EXPLAINS * max(_FINE, known):  # errors are no less than _FINE
         return ""
     w_first = quaternion(truth.poses[:, :3, :3])[:, [1, 2, 3, 0]]
     as_w_first = pose(rotation_from_quaternion(w_first), truth.positions)
@@ -153,7 +159,7 @@ def _fit(own: Trajectory, truth: Trajectory, shift: float, free: str = "scale bo
     off_t, off_w = tb @ R.T / scale - ta - J @ lever, wb @ R.T - wa
     error = max(_FINE, float(np.hypot(_rms(off_t) / size, _rms(off_w) / turn)))
     turned = float(np.degrees(np.linalg.norm(so3_log(R))))
-    return _Fit(error, scale, turned, float(np.linalg.norm(lever)), len(A), size)
+    return _Fit(error, scale, turned, float(np.linalg.norm(lever)), len(A), size, turn)
 
 
 def _rms(vectors: Array) -> float:

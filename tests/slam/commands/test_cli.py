@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+from slam.commands.run import require_no_recording
+from slam.errors import SlamError
 from slam.sequences import open_sequence
 from slam.worlds.export import write_euroc
 
@@ -45,6 +47,15 @@ def test_a_recording_is_no_place_for_a_run_and_no_trial_is_no_comparison(slam_co
     for words in (["run", "synthetic:desk?frames=1"], ["compare", "synthetic:desk?frames=1"], ["demo"]):
         fails_with_one_line(slam_command(*words, "--out", euroc, "--overwrite"), "holds a recording (format euroc)")
     assert sorted(euroc.rglob("*")) == before
+    runs = tmp_path / "runs"
+    for name in ("left", "right"):  # a run's folder may have any name
+        (runs / name).mkdir(parents=True)
+        (runs / name / "summary.json").touch()
+        (runs / name / "summary.png").touch()
+    require_no_recording(runs)
+    (runs / "left" / "summary.json").unlink()
+    with pytest.raises(SlamError, match="holds a recording"):
+        require_no_recording(runs)
     none = slam_command("compare", "synthetic:desk", "--trials", 0, "--out", tmp_path / "out")
     fails_with_one_line(none, "trials must be 1 or more")
 

@@ -6,7 +6,7 @@ import pytest
 from slam.compare.plan import Plan
 from slam.compare.statistics import difference, reach
 from slam.compare.sweep import Run
-from slam.compare.tables import groups, sentences
+from slam.compare.tables import Group, groups, sentences
 from slam.run.results import BY_KEY
 
 ATE, NEES, TRACKED, DOUBTED = (BY_KEY[key] for key in ("ate_online_m", "ratio_start", "tracked", "doubted"))
@@ -43,6 +43,14 @@ def test_the_interval_of_a_mean():
     assert (d.low, d.high) == pytest.approx((-1.4612, 6.1279), abs=1e-4)  # 7/3 ± 4.3027 · 0.8819
     assert reach(6, 20) == pytest.approx(5.60386 / np.sqrt(6), rel=1e-4)  # Student's at 1 − 0.05 / 40
     assert reach(1) == np.inf
+
+
+def test_the_spread_of_a_figure_is_about_the_mean_that_is_shown(tmp_path):
+    trials = Plan(("synthetic:desk",), ("ekf",), trials=2).every
+    runs = [Run(t, "completed", {"ratio_start": r, "tracked": r}, {}, tmp_path) for t, r in zip(trials, (1.0, 7.0))]
+    group = Group("synthetic:desk", "closed loop", {"ekf": runs})
+    assert group.mean_and_sd("ekf", NEES) == pytest.approx((5.0, 20**0.5))  # a root mean square
+    assert group.mean_and_sd("ekf", TRACKED) == pytest.approx((4.0, 18**0.5))
 
 
 def test_noise_alone_is_a_difference_in_few_reports_however_many_figures():

@@ -111,6 +111,9 @@ def rows(column, change):
 
 FAULTS = {
     "a later version": (headed(version=4), "version 4"),
+    "an earlier one, of other arrays": (lambda a: {**headed(version=2)(a), "rows": a["pixels"]}, "of version 2; this"),
+    "another file of arrays": (lambda a: {"pixels": a["pixels"]}, "is no recording"),
+    "no pixels": (lambda a: {name: array for name, array in a.items() if name != "pixels"}, "lacks 'pixels'"),
     "time runs back": (lambda a: {**a, "stamps": a["stamps"][::-1]}, "stamps must be finite and increase"),
     "an unknown landmark": (rows(2, lambda ids: ids + np.arange(len(ids))), "not in the map"),
     "a landmark twice": (rows(2, lambda ids: ids * 0), "stands twice"),

@@ -90,5 +90,7 @@ def test_errors_of_the_truth_are_said_in_sentence_table_and_head_and_a_wrong_one
     assert dict(rows([given])).get("errors of the true path itself") == ([words] if words else None)
     for said in (verdict_of_run(given), facts(given)):
         assert words in said and ("true path" in said) == bool(words)
+    assert ("truth_sigma=" in verdict_of_run(given)) == words.startswith("none")
+    assert "truth_sigma=" not in verdict_of_run(given | {"format": "recording"})  # which has no options
     wrong = given | {"consistency": {}, "truth_doubt": "it is in mm"}
     assert verdict_of_run(wrong).startswith("covariances are not judged: the true path")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slam.geometry.se3 import exp, inverse, pose, quaternion, rotation_from_quaternion, so3_exp
-from slam.geometry.trajectory import Trajectory
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.run.truth_check import truth_doubt
 
 TIMES = np.arange(0.003, 15.0, 0.01)  # a motion capture's, between the images
@@ -61,12 +61,15 @@ def test_a_usual_mistake_of_the_truth_is_named_and_alone(poses, late, words):
 
 
 def test_what_the_truth_s_own_errors_explain_is_no_mistake_of_it():
-    """Positions by satellites: off by as much as the camera moves in a second, and by little of the way."""
+    """Positions by satellites, off by as much as the camera moves in a second, and by little of the way; rotations."""
     rng, t = np.random.default_rng(2), np.arange(0.0, 120.0, 0.1)
     ahead = pose(so3_exp(0.2 * np.sin(t)[:, None] * np.array([0.0, 1.0, 0.0])), t[:, None] * np.array([0.0, 0.0, 1.0]))
     noisy = Trajectory(t, pose(ahead[:, :3, :3], ahead[:, :3, 3] + 0.7 * rng.standard_normal((len(t), 3))))
     assert "rotations do not" in truth_doubt(Trajectory(t, ahead), noisy)
-    assert truth_doubt(Trajectory(t, ahead), noisy, sigma=0.7) == ""
+    assert truth_doubt(Trajectory(t, ahead), noisy, TruthNoise(translation=0.7)) == ""
+    turned = Trajectory(t, ahead @ pose(so3_exp(0.1 * rng.standard_normal((len(t), 3))), np.zeros(3)))
+    assert "rotations do not" in truth_doubt(Trajectory(t, ahead), turned)
+    assert truth_doubt(Trajectory(t, ahead), turned, TruthNoise(rotation=0.1)) == ""
 
 
 def test_a_baseline_that_is_wrong_is_not_the_truths_fault():
