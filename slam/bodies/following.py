@@ -137,7 +137,7 @@ def found_again(body: Body, tracks: Tracks, frame: Frame) -> Array | None:
     """The pose (4, 4) of a body whose place is no longer known, None where it is not seen.
 
     Its members are recognised by their descriptors, wherever they are. Most of those must agree on one pose of it, and
-    as many as tell it from chance; they have their features then, in place.
+    as many as tell it from chance, no farther off than `max_speed` allows; they have their features then, in place.
     """
     s, f = frame.setup, frame.features
     mine = np.flatnonzero(tracks.body == body.id)
@@ -148,11 +148,15 @@ def found_again(body: Body, tracks: Tracks, frame: Frame) -> Array | None:
     found = find_consensus(s.rig, tracks.local[rows], z, guess, SIGMAS * s.sigma, _POSES, 0)
     if found.inliers.sum() < max(MIN_CONSENSUS, (len(rows) + 1) // 2):
         return None
+    T, middle = frame.T_world_left @ inverse(found.T_world_left), tracks.local[rows[found.inliers]].mean(axis=0)
+    reach = body.across + s.config.max_speed * (f.stamp - body.seen_at)
+    if np.linalg.norm(transform(T, middle) - transform(body.T, middle)) > reach:
+        return None
     rows, seen = rows[found.inliers], seen[found.inliers]
     _take_from_free(tracks, seen)
     tracks.row[rows], tracks.misfit[rows], tracks.unfound[rows] = seen, 0, 0
     tracks.look[rows] = f.descriptors[seen]
-    return np.asarray(frame.T_world_left @ inverse(found.T_world_left))
+    return np.asarray(T)
 
 
 def _take_from_free(tracks: Tracks, features: IndexArray) -> None:

@@ -104,6 +104,7 @@ def test_a_body_that_may_be_anywhere_is_recognised_if_most_of_its_points_agree(w
     """It has gone and turned where nobody looked; some descriptors are those of other points."""
     off = np.array([0.1, 0.5, -0.2, -3.0, 0.5, 4.0])
     body, tracks, features, truth = scene(6, off, np.random.default_rng(7))
+    body = replace(body, seen_at=-0.2)
     features.descriptors[:wrong] = np.roll(features.descriptors[:wrong], 1, axis=0)
     if wrong == 1:
         features.descriptors[0] = np.ones(64) / 8.0
@@ -115,6 +116,14 @@ def test_a_body_that_may_be_anywhere_is_recognised_if_most_of_its_points_agree(w
     assert np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.1
     assert np.degrees(np.arccos((np.trace(T[:3, :3].T @ truth[:3, :3]) - 1) / 2)) < 2.0
     assert tracks.row[wrong:6].tolist() == list(range(wrong, 6))
+
+
+def test_what_looks_like_a_body_farther_off_than_it_can_have_gone_is_another():
+    body, tracks, features, _ = scene(6, np.array([0.0, 0.0, 0.0, -3.0, 0.5, 4.0]), np.random.default_rng(7))
+    body = replace(body, seen_at=-0.1)
+    tracks.row[:] = -1
+    assert found_again(body, tracks, frame_of(features, max_speed=20.0)) is None
+    assert found_again(body, tracks, frame_of(features, max_speed=60.0)) is not None
 
 
 def test_a_point_that_disagrees_is_followed_on_and_counted():
