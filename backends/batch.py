@@ -2,7 +2,7 @@
 
 Every frame is a variable, every landmark that its measurements determine, and every measurement of one that the
 smoother accepted a factor of its own; the motion model ties three successive frames. Left out are landmarks that were
-seen once, with a disparity below a pixel, and what was before a restart.
+seen once, with a disparity below a pixel, and what was before the problem began anew.
 """
 
 from __future__ import annotations

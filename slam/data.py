@@ -215,7 +215,7 @@ class UpdateReport:
 
     Attributes:
         status: how it ended.
-        reason: one line where the status is not OK, or where a solver that failed was built anew; else empty.
+        reason: one line where the status is not OK, or a solver was built anew or did not converge; else empty.
         used, rejected: ids of the landmarks whose observations were used (K,), and that failed the gate (R,).
         nis, dof: normalised innovation squared νᵀ S⁻¹ ν of all used observations together (NaN if none), and its
             degrees of freedom.

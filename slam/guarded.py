@@ -29,7 +29,7 @@ def guarded(backend: Any) -> Any:
     Answers are copies: what the caller writes into them does not reach the back end. An update that used no observation
     is EMPTY. A class without ``positions`` or ``trajectory`` has those of its estimates: a filter's, never revised.
     Of its additional methods those that move the camera or the map count here, too; but what these are given, it checks
-    itself.
+    itself. A subclass inherits from its ``__wrapped__``, and is guarded itself.
     """
     own = {key: getattr(backend, key) for key in ("__qualname__", "__module__", "__doc__")}
     others = [name for name in dir(backend) if not name.startswith("_") and not hasattr(_Guarded, name)]

@@ -57,7 +57,7 @@ class Update:
 
     @cached_property
     def measured(self) -> IndexArray:
-        """And in a change of the state (12 + 3A,), which is of the camera and the landmarks in it."""
+        """And in a change of the state (12 + 3N,), which is of the camera and the landmarks in it."""
         return np.append(np.arange(POSE), self.numbers[POSE:] - HEAD + CAMERA)
 
     @cached_property
@@ -78,13 +78,13 @@ class Update:
         return np.linalg.solve(N.T @ Z, Z.T) if np.isfinite(Z).all() else None
 
     def predicted(self, camera: Camera, change: Array) -> Array:
-        """What a camera would measure (M, 3) [px] of landmarks after a change of the state (n,); NaN behind it."""
+        """What a camera would measure (M, 3) [px] of landmarks if the state changes (12 + 3N,); NaN behind it."""
         marks, asked = self.landmarks, change[self.measured[POSE:]].reshape(-1, 3)
         points = self.coordinates.points(marks.anchors, self.coordinates.moved(marks.c, asked))
         return self.measure.stereo.project((points - camera.pose[:3, 3]) @ camera.pose[:3, :3])[0]
 
     def linearised(self, camera: Camera | None = None, moved: Array | None = None) -> Linearisation:
-        """Linearised at a camera and a change (3A,) of the state's landmarks, by default those of the prior.
+        """Linearised at a camera and a change (3N,) of the state's landmarks, by default those of the prior.
 
         A landmark is at ``h = Rᵀ (Y − r)`` (paper B, Eqs. 3-5).
         """
@@ -122,7 +122,7 @@ class Linearisation:
     update: Update
     camera: Camera
     J: Array  # (12, 12): an error of the prior's camera is J times that, as an error of this one
-    change: Array  # of the state (n,) from the prior to here, in the prior's coordinates
+    change: Array  # of the state (12 + 3N,) from the prior to here, in the prior's coordinates
     z: Array  # what is predicted here (M, 3) [px], NaN behind a camera
     seen: BoolArray  # components (M, 3) that are measured, of landmarks before both cameras
     own: Array  # derivatives (M, 3, 3) of what is predicted by each landmark's coordinates, zero for others
@@ -195,7 +195,7 @@ class Solution:
 
     @cached_property
     def change(self) -> Array:
-        """Of the state (n,) from the prior, in the prior's coordinates: ``K ν = P Hᵀ y``."""
+        """Of the state (12 + 3N,) from the prior, in the prior's coordinates: ``K ν = P Hᵀ y``."""
         return np.delete(self.y @ self.at.HP[self.rows], np.s_[CAMERA:HEAD])
 
     @cached_property

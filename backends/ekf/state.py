@@ -156,13 +156,12 @@ class FilterState:
 
         What moves them is an error of the rig, the last that is considered, and none of the state's.
         """
-        s = self.with_all_of(ids)
-        rows, before = s.landmarks.rows_of(ids), s.landmarks
+        rows, before = self.landmarks.rows_of(ids), self.landmarks
         marks = before.moved(coordinates, rows, coordinates.of(before.anchors[rows], points) - before.c[rows])
         if not np.isfinite(marks.points).all():
             return self
-        covariance = s.covariance.displaced(rows, (marks.c - before.c)[rows], s._shift(marks, s.camera))
-        return replace(s, landmarks=marks, covariance=covariance)
+        covariance = self.covariance.displaced(rows, (marks.c - before.c)[rows], self._shift(marks, self.camera))
+        return replace(self, landmarks=marks, covariance=covariance)
 
     def _shift(self, marks: FilterLandmarks, camera: Camera) -> Array:
         """What is added to the errors (N, 3, 6) of landmarks that have moved, by the error of the pose."""

@@ -125,8 +125,8 @@ class IekfConfig:
 class IekfBackend(LandmarkFilter):
     """Right-invariant extended Kalman filter over the camera's motion and the landmarks.
 
-    Gate, update, iteration, recovery, and the landmarks that leave the dense state are those of `backends.ekf`; its own
-    are the motion on SO(3) and the invariant error (see the module).
+    Gate, update, iteration and recovery are those of `backends.ekf`; its own are the motion on SO(3) and the invariant
+    error (see the module).
 
     Args:
         rig: the cameras, rectified.

@@ -15,16 +15,18 @@ class SmootherConfig:
     Attributes:
         track: most poses that a smart factor spans; a landmark that is measured for longer continues in a new one. With
             a lag, no more than the lag and one: a factor ends before its first pose leaves.
-        lag: number of poses before the newest one that are smoothed with it; older ones are marginalised, so that
-            neither time nor memory grows with the run. Null (in Python None) keeps all and revises the whole path.
+        lag: number of poses with measurements before the newest one that are smoothed with it; older ones are
+            marginalised, so that neither time nor memory grows with the run. Null (in Python None) keeps all and
+            revises the whole path.
         landmarks: most landmarks that are variables of the graph. Where a frame measures no more than these, those that
             are measured for longer than a smart factor spans become variables, and keep what it says of them; but only
             while they are linear in space to less than a pixel's noise.
         poses: which frames give the graph their measurements: ``"every"`` one, or, for ``"seen"``, those that measure
             less than half of the landmarks that the last one did, or come half a factor after it. The others are solved
             for alone, from the landmarks as they stand; the graph has them by their motion and this solution.
-        past: number of poses before those, at least, whose measurements are kept (half as many poses more before
-            they are thrown away): where landmarks are seen again, or measurements are mended, they say where those are.
+        past: number of poses before those of the lag, at least, whose measurements are kept (half as many poses more
+            before they are thrown away): where landmarks are seen again, or measurements are mended, they say where
+            those are.
 
     Raises:
         ConfigurationError: a value is out of its range.

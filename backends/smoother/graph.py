@@ -176,7 +176,8 @@ class Graph:
                 J, noise = adjoint(inverse(aside.relative)), aside.own
                 columns = slice(6 * (aside.anchor - begin), 6 * (aside.anchor - begin) + 6)
             cross = J @ P[columns]
-            P = np.block([[P, cross.T], [cross, cross[:, columns] @ J.T + noise]])
+            own = cross[:, columns] @ J.T + noise
+            P = np.block([[P, cross.T], [cross, 0.5 * (own + own.T)]])  # what is not symmetric would grow fourfold
         rows = slice(6 * (first - begin), 6 * (last + 1 - begin))
         return first, P[rows, rows]
 

@@ -30,7 +30,8 @@ class SmootherLandmarks(LandmarkRows):
     world: BoolArray  # whether that does not depend on any pose (S,)
     z: Array  # its last measurements (S, RECENT, 3)
     pose: IndexArray  # and the numbers of their poses (S, RECENT), −1 for none
-    factor: IndexArray  # its smart factor, by the number of the pose from which its span counts (S,); or VARIABLE
+    # its smart factor, by the number of the pose from which its span counts (S,); or VARIABLE, but not of known ones
+    factor: IndexArray
     linearised: Array  # where the graph has it linearised, if it is a variable (S, 3) [m]
     by_rig: Array  # derivatives of the positions by errors of the rig (S, 3, m)
 

@@ -63,12 +63,12 @@ class SmootherState:
     """
 
     first: int  # number of the first pose that is kept
-    begun: int  # number of the pose with which the present problem begins: the first, or that of a restart
+    begun: int  # number of the pose with which the present problem begins: the first, or where it began anew
     poses: Array  # T_world_left (K, 4, 4)
     stamps: Array  # their times (K,) [s]
     rests: BoolArray  # whether the camera rested since the pose before (K,)
-    ages: IndexArray  # how many poses up to each (K,) saw something: those in the dark take no part of the lag
-    sights: tuple[Sight, ...]  # what was measured from each
+    ages: IndexArray  # how many poses up to each (K,) gave the graph anything: others take no part of the lag
+    sights: tuple[Sight, ...]  # what the graph is given of each
     spread: Array  # covariance in the world of each when it was the newest that was solved for (K, 6, 6)
     pair: Array  # joint covariance (12, 12) of the errors of the last two poses relative to the anchor
     shared: Array  # covariance (6, 12) of the anchor's own error in the world with these
@@ -78,7 +78,7 @@ class SmootherState:
     prior: Array = field(default_factory=lambda: np.zeros((6, 6)))
     start: Array = field(default_factory=lambda: np.eye(4))
     turned: Array = field(default_factory=lambda: np.zeros((3, 3)))
-    anchor: int = 0  # number of the last pose that measured or added a landmark
+    anchor: int = 0  # number of the last pose that gave the graph anything
     solved: int = -1  # number of the newest pose that the graph solved for; −1 for none
     chosen: int = -1  # number of the last pose whose measurements the graph was given
     aside: Mapping[int, Aside] = field(default_factory=dict)  # by number: poses that were solved for alone

@@ -32,7 +32,7 @@ _ALONE: tuple[Array, Array] = np.zeros((12, 12)), np.zeros((6, 12))  # `pair` an
 class Steps(RectifiedMeasurement):
     """What the steps need besides the state."""
 
-    config: SmootherConfig  # limits
+    config: SmootherConfig  # options
 
     @property
     def track(self) -> int:
@@ -161,7 +161,7 @@ class Steps(RectifiedMeasurement):
 
     def _saw_the_same(self, s: SmootherState, serials: IdArray) -> bool:
         """Whether the newest pose measured at least half of what the last one in the graph did, not long ago."""
-        near = s.begun <= s.chosen and s.number - s.chosen <= self.track // 2
+        near = s.begun <= s.chosen and s.number - s.chosen <= min(self.track // 2, _DARK - 1)
         return near and np.isin(s.sights[s.of(s.chosen)].serials, serials).mean() >= _SAME
 
     def settled(self, s: SmootherState, solved: Solved) -> SmootherState:
@@ -281,7 +281,7 @@ def _aside(s: SmootherState, T: Array, information: Array, by_rig: Array) -> Smo
 def _anchored(s: SmootherState) -> SmootherState:
     """With the newest pose as the anchor, where it is predicted if nothing was measured.
 
-    Where it may have turned anyhow since, no linearisation holds: the problem begins anew.
+    Nothing but the motion ties it to the last: where it may have turned anyhow, the problem begins anew.
     """
     if s.anchor == s.number:
         return s

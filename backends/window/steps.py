@@ -31,7 +31,7 @@ _STILL = np.zeros((6, 6))
 class Steps(RectifiedMeasurement):
     """What the steps need besides the state."""
 
-    config: WindowConfig  # limits
+    config: WindowConfig  # options
 
     def predicted(self, s: WindowState, stamp: float, rests: bool) -> WindowState:
         """With a pose at `stamp` [s], by the motion model, or that before if the camera rests.

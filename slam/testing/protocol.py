@@ -11,7 +11,7 @@ from slam.data import Observations, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
 from slam.interfaces import Backend
-from slam.registry import METHODS
+from slam.registry import require_methods
 from slam.system import StereoSlam
 from slam.testing.scene import (
     DT,
@@ -40,10 +40,10 @@ _FRAMES = 8  # of the run in a world
 
 def every_method_is_there(factory: Factory) -> None:
     """It is made as ``factory(rig, models=models)`` and has the seven methods of `slam.interfaces.Backend`."""
-    backend: Backend = factory(RIG, models=MODELS)
-    names = METHODS["backends"]
-    missing = [name for name in names if not callable(getattr(backend, name, None))]
-    require(not missing, f"{', '.join(missing)} missing: a back end has {', '.join(names)}")
+    try:
+        require_methods("backends", factory(RIG, models=MODELS))
+    except ConfigurationError as error:
+        require(False, str(error))
 
 
 def answers_are_as_documented(factory: Factory) -> None:
