@@ -20,7 +20,17 @@ from slam.files import read_object, write_text
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import pair
 from slam.run.outputs import csv_number, csv_rows
-from slam.run.results import COMPARED, DOUBTED, METRICS, Metric, errors_of_truth, number, verdict, verdict_of_run
+from slam.run.results import (
+    COMPARED,
+    DOUBTED,
+    METRICS,
+    RATIOS,
+    Metric,
+    errors_of_truth,
+    number,
+    verdict,
+    verdict_of_run,
+)
 from slam.run.run_data import RunData
 
 DIFFERENCE_COLUMNS = (
@@ -79,7 +89,9 @@ class Group:
     def first_metrics(self) -> list[Metric]:
         """Of these those of the first table: the main ones, and those in which a back end is better or worse."""
         told = {key for key, each in self.compared.items() for d in each.values() if d.verdict in ("better", "worse")}
-        return [m for m in self.metrics if m.main or m.key in told]
+        known = {m.key for m in self.metrics}
+        judged = next((key for key in RATIOS if key in known), "")
+        return [m for m in self.metrics if m.main or m.key in told or m.key == judged]
 
     def failures(self, backend: str) -> int:
         """Number of runs that failed."""

@@ -61,24 +61,26 @@ def consistency_figures(
         "mean NEES" from the start, "NEES over L m" for each of `STRETCHES`; six is right for all of these, and "band
         low" and "band high" hold 95 % of runs; "doubtful truth over L m" and "no covariance over L m", the shares of
         stretches left out because the truth contradicts itself or an old place was measured again within them, where
-        there are any.
+        there are any; "share of truth over L m" and "from the start", how much of the errors expected is the truth's.
     """
     start = int(np.argmin(interpolated(true, noise)))  # the first pose that was measured
     later = np.arange(start + 1, len(own))
-    from_start = stretch_nees(own, true, covariances, noise, np.full(len(later), start), later, common, joint)
+    from_start, share = stretch_nees(own, true, covariances, noise, np.full(len(later), start), later, common, joint)
     low, high = chi_square_band(_DOF)  # of one value: errors of the rig make all frames of a run as good as one
     figures = {"mean NEES": _mean(from_start), "band low": low, "band high": high, "dof": float(_DOF)}
+    figures["share of truth from the start"] = _mean(share)
     closed = _closings(covariances)
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(true.positions, axis=0), axis=1).cumsum()])
     for length in STRETCHES:
         last = np.searchsorted(along, along + length).astype(np.intp)
         starts = np.flatnonzero(last < len(own))
-        values = stretch_nees(own, true, covariances, noise, starts, last[starts], common, joint)
+        values, share = stretch_nees(own, true, covariances, noise, starts, last[starts], common, joint)
         values[closed[starts] != closed[last[starts]]] = np.nan
         left_out = doubtful(true, noise, starts, last[starts])
         none = ~np.isfinite(values) & ~left_out
         if np.isfinite(values).any() and none.mean() <= _MOST:
             figures[f"NEES over {length:g} m"] = _mean(values)
+            figures[f"share of truth over {length:g} m"] = _mean(share[np.isfinite(values)])
         for what, rows in (("doubtful truth", left_out), ("no covariance", none)):
             if rows.any():
                 figures[f"{what} over {length:g} m"] = float(np.mean(rows))
@@ -98,10 +100,10 @@ def _closings(covariances: Array) -> RowArray:
 def stretch_nees(
     own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise, first: RowArray, last: RowArray,
     common: Sequence[CommonError] | None = None, joint: JointErrors | None = None,
-) -> Array:  # fmt: skip
-    """NEES (M,) of the relative poses between rows `first` and `last` (M,).
+) -> tuple[Array, Array]:  # fmt: skip
+    """NEES (M,) of the relative poses between rows `first` and `last` (M,), and the share of the truth's errors in it.
 
-    NaN where the covariance is none, or the truth is doubtful.
+    That is how much of six is expected of them. NaN where the covariance is none, or the truth is doubtful.
     """
     first, last = np.broadcast_arrays(first, last)
     estimated = inverse(own.poses[first]) @ own.poses[last]
@@ -113,18 +115,21 @@ def stretch_nees(
     given = np.full_like(earlier, np.nan) if joint is None else joint.between(first, last)  # by the back end
     shared = np.where(np.isfinite(given), given, earlier) @ At
     N = noises[last] + earlier @ At - shared - np.swapaxes(shared, 1, 2)
-    N = N + truth_covariances(true, noise, first, last, A)
+    of_truth = truth_covariances(true, noise, first, last, A)
+    N = N + of_truth
     N, G = _shared(A, [(common[i], common[j]) for i, j in zip(first, last)], N)
     N = 0.5 * (N + np.swapaxes(N, 1, 2))
     usable = np.isfinite(residuals).all(axis=1) & ~doubtful(true, noise, first, last)
     usable[usable] = are_covariances(N[usable]) & are_covariances(_with(N[usable], G[usable]))
-    values = np.full(len(first), np.nan)
+    values, share = np.full((2, len(first)), np.nan)
     if usable.any():
         N, A, G = N[usable], A[usable], G[usable]
         J = by_mounting(true, noise, first[usable], last[usable], A)
         errors = _remounted(np.concatenate([residuals[usable, :, None], G], axis=2), J, _with(N, G))
-        values[usable] = nees(errors[:, :, 0], _with(N, errors[:, :, 1:]))
-    return values
+        P = _with(N, errors[:, :, 1:])
+        values[usable] = nees(errors[:, :, 0], P)
+        share[usable] = np.trace(np.linalg.solve(P, of_truth[usable]), axis1=1, axis2=2) / _DOF
+    return values, share
 
 
 def are_covariances(P: Array) -> BoolArray:

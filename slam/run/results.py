@@ -103,6 +103,9 @@ METRICS = (
     Metric("ratio_start", "errors / claimed σ from the start (1 is right)", "", "consistency/mean NEES", "one",
            "compared main"),
     Metric("ratio_100m", "errors / claimed σ over 100 m (1 is right)", "", "consistency/NEES over 100 m", "one"),
+    *(Metric(f"truth_{key}", f"share of the true path's errors in what is expected {over}", "",
+             f"consistency/share of truth {over}", shown="")
+      for key, over in (("start", "from the start"), *((f"{L}m", f"over {L} m") for L in (1, 10, 100)))),
     Metric("exact_calibration", "cameras without errors, of which covariances count some", "",
            f"consistency/{EXACT}", shown=""),
     Metric("pixels_alone", "covariances of pixel noise alone", "", f"consistency/{PIXELS_ALONE}", shown=""),
@@ -123,12 +126,13 @@ COMPARED = tuple(metric for metric in METRICS if "compared" in metric.shown)
 _LEAST = {"compiling": 0.05, "loops_closed": 0.0}  # up to which a figure is not worth a row
 
 #: Errors over claimed σ by key, with what they are over; the best to judge by first: errors from the start add up.
-_RATIOS = {
+RATIOS = {
     "ratio_10m": "over 10 m",
     "ratio_1m": "over 1 m",
     "ratio_start": "from the start",
     "ratio_100m": "over 100 m",
 }
+_MOSTLY = 0.5  # share of the truth's errors in those expected, from which it is said
 _OF_A_PATH = {"loops_closed", "path_m", "speed", "sigma_m"}
 
 
@@ -195,7 +199,10 @@ def errors_of_truth(summary: Mapping[str, Any]) -> str:
         return ""
     if not any(truth.values()):
         return "none, it is taken as exact"
-    return f"σ {number(1e3 * truth['translation'])} mm, {number(float(np.degrees(truth['rotation'])))}°"
+    text = f"σ {number(1e3 * truth['translation'])} mm, {number(float(np.degrees(truth['rotation'])))}°"
+    if truth.get("mounting") or truth.get("lever"):
+        text += f", mounting {number(1e3 * truth['lever'])} mm, {number(float(np.degrees(truth['mounting'])))}°"
+    return text + (f", clock {number(1e3 * truth['clock'])} ms" if truth.get("clock") else "")
 
 
 def _measured(summary: Mapping[str, Any]) -> int:
@@ -211,7 +218,7 @@ def _at(tree: Any, place: str, default: Any = None) -> Any:
 
 def _ratios(found: Mapping[str, float]) -> dict[str, float]:
     """How many times as large as claimed errors are, and over what; the one to judge by first."""
-    return {over: found[key] for key, over in _RATIOS.items() if np.isfinite(found.get(key, np.nan))}
+    return {over: found[key] for key, over in RATIOS.items() if np.isfinite(found.get(key, np.nan))}
 
 
 def verdict(found: Mapping[str, float], runs: int = 1) -> str:
@@ -235,6 +242,9 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     times = "as large as" if number(ratio) == "1" else f"{number(ratio)} times what"
     times = f"{judged} errors of the pose are {times} they claim"
     band = f"({low:.2f} to {high:.2f} in 95 % of {of})"
+    share = found.get(next(key for key, over in RATIOS.items() if over == judged).replace("ratio", "truth"), 0.0)
+    if share > _MOSTLY:
+        others.append(f"{100 * share:.0f} % of the error that is expected {judged} is the true path's own")
     if exact:
         others.append("they count errors of the calibration, and this world's cameras have none")
     if found.get("pixels_alone"):
@@ -247,7 +257,7 @@ def verdict_of_run(summary: Mapping[str, Any]) -> str:
     text, honest = verdict(figures(summary)), summary.get("consistency") or {}
     if not text and summary.get("truth_doubt"):
         return "covariances are not judged: the true path and the estimated one do not fit, see the run's warnings"
-    doubtful = {over: share for over in _RATIOS.values() if (share := honest.get(f"doubtful truth {over}"))}
+    doubtful = {over: share for over in RATIOS.values() if (share := honest.get(f"doubtful truth {over}"))}
     if not text and not honest.get("dof"):
         return ""
     if not text and _at(summary, "loops/known"):

@@ -45,6 +45,9 @@ def test_relative_nees_of_honest_odometry_is_six():
     for key in ("mean NEES", "NEES over 1 m", "NEES over 10 m"):
         assert 5.0 < figures[key] < 7.0, key
     assert "NEES over 100 m" not in figures
+    assert figures["share of truth over 10 m"] == 0.0
+    noisy = mean_over_seeds(TruthNoise(rotation=0.01, translation=1.0))
+    assert noisy["share of truth over 10 m"] > 0.9 and 5.0 < noisy["NEES over 10 m"] < 7.0
     band = f"{np.sqrt(figures['band low'] / 6):.2f} to {np.sqrt(figures['band high'] / 6):.2f}"
     assert band in verdict({"ratio_start": 1.0})  # one band in a summary and in what is said of it
 
@@ -106,7 +109,7 @@ def test_stretches_without_a_usable_covariance_are_left_out():
     own, true, P = odometry(0)
     P[30] = 1e-9 * np.eye(6)  # as after a loop: smaller than before it
     first = np.arange(20, 30)
-    assert np.isnan(stretch_nees(own, true, P, NONE, first, np.full(10, 30))).all()
+    assert np.isnan(stretch_nees(own, true, P, NONE, first, np.full(10, 30))[0]).all()
 
 
 def test_a_length_over_which_the_frames_own_errors_are_larger_than_the_growth_has_no_figure():

@@ -7,7 +7,7 @@ import pytest
 from slam.compare.plan import Plan, Trial
 from slam.compare.sweep import Run
 from slam.compare.tables import groups, honesty
-from slam.run.results import facts, figures, rows, verdict, verdict_of_run
+from slam.run.results import errors_of_truth, facts, figures, rows, verdict, verdict_of_run
 
 TEN, ONE, START, HUNDRED = "ratio_10m", "ratio_1m", "ratio_start", "ratio_100m"
 
@@ -47,6 +47,21 @@ def test_covariances_that_are_too_large_on_an_exact_world_say_why(tmp_path):
         assert said.endswith("this world's cameras have none") == exact == ("are on the safe side" in said)
         (group,) = groups(plan, [Run(trial, "completed", figures(tree), {}, tmp_path)])
         assert honesty(group) == [f"ekf: {said}."]
+
+
+def test_a_truth_less_exact_than_what_is_claimed_is_said_with_all_its_errors():
+    """Claims three times too small were said to hold: most of the error that is expected was the truth's."""
+    tree = summary(1.0) | {
+        "truth": {"translation": 0.01, "rotation": 0.01, "mounting": 0.0, "lever": 0.02, "clock": 0.01}
+    }
+    assert "the true path's own" not in verdict_of_run(tree)
+    tree["consistency"] |= {
+        "NEES over 10 m": 6.0,
+        "share of truth over 10 m": 0.84,
+        "share of truth from the start": 0.2,
+    }
+    assert "; 84 % of the error that is expected over 10 m is the true path's own" in verdict_of_run(tree)
+    assert errors_of_truth(tree) == "σ 10 mm, 0.573°, mounting 20 mm, 0°, clock 10 ms"
 
 
 def test_doubtful_truth_is_named_and_not_the_covariance():
