@@ -91,7 +91,7 @@ PAGES = {
     "cost": (
         "Cost",
         "What does a frame cost, next to others?",
-        "On a drive about half of the CPU time of SIFT for one image, on small images nearly as much, however long the "
+        "On a drive about a third of the CPU time of SIFT for one image, on small images nearly as much, however long the "
         "run.",
     ),
 }
