@@ -91,8 +91,8 @@ PAGES = {
     "cost": (
         "Cost",
         "What does a frame cost, next to others?",
-        "On a drive about a third of the CPU time of SIFT for one image, on small images nearly as much, however long the "
-        "run.",
+        "On a drive about a third of the CPU time of SIFT for one image, on small images nearly as much, however long "
+        "the run.",
     ),
 }
 ERRORS = "Error of the online pose (solid), and the standard deviation that is claimed (dashed)."
