@@ -362,7 +362,7 @@ class FrameResult:
         keyframe: whether the frame has become a keyframe.
         returned: ids of landmarks of an old place that joined the map as another back end took over there.
         common: the part of the pose's error that all frames share; empty after a loop, which mixes it with noise.
-        recent: the last few poses, whose joint covariance the back end tells; None where it does not, and after a loop.
+        recent: the last poses with their joint covariance; None where it is not told, after a loop, and in a new map.
     """
 
     index: int

@@ -50,7 +50,7 @@ class _Guarded:
             raise ConfigurationError(f"{self._name}: unknown option {min(unknown)!r}")
         self._backend = self.__wrapped__(rig, models or EstimatorModels(), **options)
         self._ids, self._measured, self._stamp = set[int](), True, float("nan")
-        self._path: dict[float, Array] = {}
+        self._path: dict[float, Array] = {}  # poses by stamp, of a class without a trajectory
 
     def __getattr__(self, attribute: str) -> Any:  # what the back end sets itself
         if attribute.startswith("_"):
@@ -77,7 +77,8 @@ class _Guarded:
         require_stamp(self._name, stamp, None if np.isnan(self._stamp) else self._stamp)
         found = deepcopy(predict(float(stamp)))
         self._stamp, self._measured = float(stamp), False
-        self._path[self._stamp] = found.T_world_left.copy()
+        if not hasattr(self._backend, "trajectory"):
+            self._path[self._stamp] = found.T_world_left.copy()
         return found
 
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
@@ -89,7 +90,8 @@ class _Guarded:
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
         report = deepcopy(self._backend.update(observations, guess))
         self._measured = True
-        self._path[self._stamp] = self._backend.estimate(False).T_world_left.copy()
+        if not hasattr(self._backend, "trajectory"):
+            self._path[self._stamp] = self._backend.estimate(False).T_world_left.copy()
         if report.status is UpdateStatus.OK and not len(report.used):
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", report.rejected)
         return report

@@ -138,7 +138,7 @@ class RecentBackend(Protocol):
     """Additional method of a back end that knows how the errors of the camera's last poses hang together.
 
     Moving bodies need it: a velocity is the difference of two poses. Of a back end without it the joint covariance is
-    derived from the poses' own ones.
+    derived from the poses' own ones, and errors count as dead reckoning's where covariances are judged.
     """
 
     def recent(self, n: int) -> RecentPoses:

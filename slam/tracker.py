@@ -298,7 +298,7 @@ def frame_result(
         keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index,
         returned=step.joined,
         common=common,
-        recent=step.recent if atlas.anchor is None else None,  # the estimate's errors are another world's then
+        recent=step.recent if atlas.anchor is None else None,  # else the estimate's errors are of another world
     )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from slam.tracks.table import Tracks
 
 _TOO_FAR = 3.0  # expected points so far off that linearising there is worse than at the measured point [px]
 _STEPS = 4  # numerics: of Gauss-Newton at most
+_ROUNDED = 1e-6  # numerics: disparity [px] up to which rounding decides what it is
 MOVES = 12.0  #: derived: χ²(3) at 99.3 % of the velocity, from which it counts
 AGREES = 11.3  #: derived: χ²(3) at 99 %, of places or velocities that are the same
 
@@ -102,13 +103,13 @@ def revise_tracks(
 
 
 def _shifts(points: Array, T_world_left: Array, rig: StereoRig, correct: Callable[[Array], Array]) -> Array:
-    """By what points (N, 3) seen from poses (N, 4, 4) move, in world coordinates (N, 3); not at all out of view."""
+    """By what points (N, 3) seen from poses (N, 4, 4) move in the world (N, 3); not out of view or at infinity."""
     R = T_world_left[:, :3, :3]
     z, J = rig.project_stereo(times_vectors(np.swapaxes(R, 1, 2), points - T_world_left[:, :3, 3]))
-    seen = np.isfinite(z).all(axis=1) & rig.left.in_image(z[:, :2]) & (np.abs(z[:, 0] - z[:, 2]) < rig.width)
-    good = np.flatnonzero(seen)
+    disparity = z[:, 0] - z[:, 2]
+    good = np.flatnonzero(rig.left.in_image(z[:, :2]) & (disparity > _ROUNDED) & (disparity < rig.width))
     change = correct(z[good]) - z[good]
-    known = np.isfinite(change).all(axis=1) & (np.linalg.det(J[good]) != 0.0)  # else disparity is rounded off
+    known = np.isfinite(change).all(axis=1)
     good, change, shifts = good[known], change[known], np.zeros_like(points)
     shifts[good] = times_vectors(R[good], np.linalg.solve(J[good], change[..., None])[..., 0])
     return shifts

@@ -42,7 +42,7 @@ class JointErrors:
         """By covariances (K, 6, 6), for each frame, of the last K poses' errors with its own, which comes last."""
         if not any(map(len, blocks)):  # a back end that tells none, or a path without poses
             return None
-        by_lag = np.full((len(blocks), max(map(len, blocks)), _DOF, _DOF), np.nan)
+        by_lag = np.full((len(blocks), max(2, *map(len, blocks)), _DOF, _DOF), np.nan)
         for k, its in enumerate(blocks):
             by_lag[k, : len(its)] = np.swapaxes(its[::-1], 1, 2)
         return cls(by_lag, np.array([_gains(by_lag, k, len(its) - 1) for k, its in enumerate(blocks)]), frames)
@@ -65,7 +65,7 @@ class JointErrors:
         for k in range(F):
             on = np.flatnonzero((begun <= k) & (k <= ended))
             lag = k - begun[on]
-            now = (self.gains[k] @ carried[on, :-1].reshape(-1, (K - 1) * _DOF, _DOF)).reshape(-1, _DOF, _DOF)
+            now = self.gains[k] @ carried[on, :-1].reshape(len(on), (K - 1) * _DOF, _DOF)
             near = lag < K
             now[near] = self.by_lag[k, lag[near]]
             carried[on, 1:], carried[on, 0] = carried[on, :-1], now

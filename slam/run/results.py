@@ -103,9 +103,9 @@ METRICS = (
     Metric("ratio_start", "errors / claimed σ from the start (1 is right)", "", "consistency/mean NEES", "one",
            "compared main"),
     Metric("ratio_100m", "errors / claimed σ over 100 m (1 is right)", "", "consistency/NEES over 100 m", "one"),
-    *(Metric(f"truth_{key}", f"share of the true path's errors in what is expected {over}", "",
+    *(Metric(f"truth {over}", f"share of the true path's errors in what is expected {over}", "",
              f"consistency/share of truth {over}", shown="")
-      for key, over in (("start", "from the start"), *((f"{L}m", f"over {L} m") for L in (1, 10, 100)))),
+      for over in ("from the start", "over 1 m", "over 10 m", "over 100 m")),
     Metric("exact_calibration", "cameras without errors, of which covariances count some", "",
            f"consistency/{EXACT}", shown=""),
     Metric("pixels_alone", "covariances of pixel noise alone", "", f"consistency/{PIXELS_ALONE}", shown=""),
@@ -242,8 +242,7 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     times = "as large as" if number(ratio) == "1" else f"{number(ratio)} times what"
     times = f"{judged} errors of the pose are {times} they claim"
     band = f"({low:.2f} to {high:.2f} in 95 % of {of})"
-    share = found.get(next(key for key, over in RATIOS.items() if over == judged).replace("ratio", "truth"), 0.0)
-    if share > _MOSTLY:
+    if (share := found.get(f"truth {judged}", 0.0)) > _MOSTLY:
         others.append(f"{100 * share:.0f} % of the error that is expected {judged} is the true path's own")
     if exact:
         others.append("they count errors of the calibration, and this world's cameras have none")

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.detector import MovingObjectDetector
-from slam.bodies.fits import constant_velocity
+from slam.bodies.fits import constant_velocity, revise_tracks
 from slam.data import Estimate, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import inverse, transform
@@ -58,3 +58,13 @@ def velocities(revised):
 def test_tracks_stand_still_when_the_correction_changes():
     assert np.median(np.abs(velocities(revised=False))) > 1.0
     assert np.median(np.abs(velocities(revised=True))) < 0.2  # what is of second order in the change is left
+
+
+def test_a_point_whose_disparity_is_rounded_off_stays_where_it_is():
+    """It ended a run: nothing says how far it moves as its disparity is corrected."""
+    points, first = np.array([[0.0, 0.0, 40.0], [1.0, 0.0, 1e20]]), np.arange(2)
+    tracks = Tracks.empty(64, 12)
+    tracks.begin(first, first, features_at(np.eye(4), points, AT), points)
+    revise_tracks(tracks, {}, np.tile(np.eye(4), (12, 1, 1)), 0, RIG, mend)
+    assert abs(tracks.position[0, 2] - 40.0) > 1.0
+    assert np.array_equal(tracks.position[1], points[1])

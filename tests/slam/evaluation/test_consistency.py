@@ -91,6 +91,8 @@ def test_joint_errors_are_not_known_across_a_frame_of_which_the_back_end_tells_n
     found = JointErrors.of(blocks, np.arange(60)).between(first, last)
     assert np.isfinite(found).all(axis=(1, 2)).tolist() == [True, False, False, True, True, True]
     assert np.allclose(found[3], blocks[34][1].T) and np.allclose(found[5], P[7])
+    alone = JointErrors.of([each[-1:] for each in blocks], np.arange(60)).between(first, last)
+    assert np.isfinite(alone).all(axis=(1, 2)).tolist() == [False, False, False, False, False, True]
 
 
 def test_a_constant_turn_of_the_truths_sensor_is_no_rotation_error():
