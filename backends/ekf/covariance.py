@@ -142,19 +142,21 @@ class Covariance:
 
     # --- an update ---
 
-    def corrected(self, V: Array, lost_by_rig: Array, J: Array, shift: Array) -> Covariance:
-        """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ = P − V Vᵀ`` (paper A, Eq. 11).
+    def corrected(self, V: Array, U: Array, by_rig: Array, J: Array, shift: Array) -> Covariance:
+        """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ`` (paper A, Eq. 11).
 
         The last poses keep the covariance that they have among themselves.
 
         Args:
-            V: ``P Hᵀ L⁻ᵀ`` (n, 3M), with ``S = L Lᵀ``.
-            lost_by_rig: L⁻¹ times derivatives (3M, m) of the innovation by errors of the rig.
+            V: (n, ·) and
+            U: (n, ·) with ``K S Kᵀ = V Vᵀ − U Uᵀ``.
+            by_rig: what errors of the rig change in the update (n, m), as derivatives.
             J: the camera's error becomes J (12, 12) times what it was,
             shift: and then to those of the landmarks this (N, 3, 6) times that of the pose is added.
         """
-        last, by_rig, M = slice(CAMERA, HEAD), self.by_rig - V @ lost_by_rig, np.zeros((len(self.P), CAMERA))
+        last, by_rig, M = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), CAMERA))
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
+        P = dsyrk(1.0, U, 1.0, P.T, overwrite_c=1).T if U.size else P
         P[:CAMERA, :CAMERA] = mirrored(P[:CAMERA, :CAMERA])
         M[:CAMERA], M[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
         half = 0.5 * M @ P[:CAMERA, :CAMERA]  # T = 1 + [M, 0]:  T P Tᵀ = P + M Yᵀ + Y Mᵀ,  Y = P[:, :12] + M P_cc / 2
@@ -172,8 +174,8 @@ class Covariance:
         """
         by_rig = self.by_rig.copy()
         by_rig[self.numbers(rows).ravel(), -1:] -= change.reshape(-1, 1)
-        nothing = np.zeros((len(self.P), 0)), np.zeros((0, by_rig.shape[1]))
-        return replace(self, by_rig=by_rig).corrected(*nothing, np.eye(CAMERA), shift)
+        nothing = np.zeros((len(self.P), 0))
+        return replace(self, by_rig=by_rig).corrected(nothing, nothing, 0 * by_rig, np.eye(CAMERA), shift)
 
 
 def mirrored(P: Array) -> Array:

@@ -254,10 +254,10 @@ class LandmarkFilter:
             after = s.corrected(found)
         except LinAlgError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self.name}: {error}")
-        used, w = found.used, found.w
+        used = found.used
         dof, ids = int(np.isfinite(z[used]).sum()), observations.ids
         reason = "" if found.linear else f"{self.name}: not linear after {self._iterations} iterations"
-        return after, UpdateReport(UpdateStatus.OK, reason, ids[used], ids[~used], float(w @ w), dof)
+        return after, UpdateReport(UpdateStatus.OK, reason, ids[used], ids[~used], found.nis, dof)
 
     def _started(self, what: str) -> FilterState:
         if self.state.frame < 0:

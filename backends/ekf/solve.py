@@ -13,7 +13,7 @@ import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg.lapack import dpotrf
 
-from backends.ekf.covariance import CAMERA, POSE
+from backends.ekf.covariance import HEAD, POSE
 from backends.ekf.innovation import Linearisation, Solution, Update
 from slam.data import BoolArray
 from slam.geometry.se3 import Array
@@ -62,10 +62,8 @@ def solve(gated: Gated) -> Solution | None:
         faced = update.facing(found.camera.pose)
         if faced is not update:  # the coordinates of its error are nearly singular there
             found, update = _with_readmitted(gate(faced, found.camera.pose)), faced
-    if found is not None:
-        root = found.by_pose
-        if dpotrf(update.covariance.pose - root.T @ root, lower=1)[1] != 0:
-            raise LinAlgError("the pose's covariance would not stay positive definite")
+    if found is not None and dpotrf(found.pose_covariance, lower=1)[1] != 0:
+        raise LinAlgError("the pose's covariance would not stay positive definite")
     return found
 
 
@@ -73,7 +71,8 @@ def _with_readmitted(gated: Gated) -> Solution | None:
     """With what passed the gate, and again where the solution predicts more."""
     found = _agreeing(gated, gated.used)
     if found is not None:
-        more = _predicted(found, gated)
+        there = found.at.seen.any(axis=1) & np.isfinite(gated.distances)
+        more = ~found.used & there & (found.distances() <= gated.limits)
         found = (_agreeing(gated, found.used | more) or found) if more.any() else found
     return found
 
@@ -87,29 +86,12 @@ def _agreeing(gated: Gated, used: BoolArray) -> Solution | None:
     while used.any():
         found = _iterate(gated.at, used)
         used = found.used
-        excess = found.distances() / gated.limits
+        excess = np.where(used, found.distances() / gated.limits, 0.0)
         worst = excess.max()
         if worst <= 1:
             return found if used.any() else None
         used = used & (excess <= max(1.0, 0.5 * worst))
     return None
-
-
-def _predicted(found: Solution, gated: Gated) -> BoolArray:
-    """Which landmarks (mask (M,)) that a solution does not use lie within the gate of what it predicts of them.
-
-    The gate tested them at the prior. With X the covariance of w with such a landmark's innovation ν, that given the
-    used ones is ``ν − Xᵀ w``, and its covariance ``S − Xᵀ X``.
-    """
-    at, agree = found.at, np.zeros(len(found.used), bool)
-    out = np.flatnonzero(~found.used & at.seen.any(axis=1) & np.isfinite(gated.distances))
-    if len(out):
-        numbers = (3 * out[:, None] + np.arange(3)).ravel()
-        X = found.L_inverse @ at.S[found.rows[:, None], numbers]
-        S = at.S[numbers[:, None], numbers] - X.T @ X
-        residuals = (at.nu[numbers] - found.w @ X).reshape(-1, 3)
-        agree[out] = squared_distances(residuals, _blocks(S)) <= gated.limits[out]
-    return agree
 
 
 def _blocks(S: Array) -> Array:
@@ -129,7 +111,7 @@ def _iterate(at: Linearisation, used: BoolArray) -> Solution:
     update, found = at.update, None
     for _ in range(update.iterations):
         if found is not None:
-            at = update.linearised(found.camera, found.change[CAMERA:])
+            at = update.linearised(found.camera, found.change[HEAD:])
         used = used & at.seen.any(axis=1)
         found = at.solved(used)
         if not np.isfinite(found.change).all() or np.abs((found.change - at.change)[3:6]).max() > np.pi:
@@ -143,12 +125,11 @@ def _iterate(at: Linearisation, used: BoolArray) -> Solution:
 def _linear(found: Solution) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
     now, update = found.at, found.at.update
-    step = (found.change - now.change)[update.measured]
+    step = (found.change - now.change)[update.numbers]
     seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
     errors = update.predicted(found.camera, found.change) - now.z - (now.own @ seen[:, :, None])[:, :, 0]
     errors = np.where(now.seen & found.used[:, None], errors, 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
-    shift = (found.L_inverse @ errors.reshape(-1)[found.rows]) @ found.by_pose
-    variances = update.covariance.pose.diagonal() - (found.by_pose**2).sum(axis=0)
-    return bool((shift**2 <= _POSE_SHARE**2 * variances).all())
+    shift = found.weighted(errors.reshape(-1)) @ now.HP[:, :POSE]
+    return bool((shift**2 <= _POSE_SHARE**2 * found.pose_covariance.diagonal()).all())

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from backends.ekf.camera import Camera, Motion
-from backends.ekf.covariance import CAMERA, HEAD, Covariance
+from backends.ekf.covariance import HEAD, Covariance
 from backends.ekf.innovation import Solution
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.data import IdArray, IndexArray
@@ -142,11 +142,11 @@ class FilterState:
         and Bonnabel, 2015). Raises LinAlgError where the new state is not finite, or a variance is lost in rounding.
         """
         update, camera = found.at.update, found.camera
-        marks = self.landmarks.moved(update.coordinates, self._parts()[0], found.change[CAMERA:].reshape(-1, 3))
+        marks = self.landmarks.moved(update.coordinates, self._parts()[0], found.change[HEAD:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise LinAlgError("the corrected state is not finite")
         J, shift = update.camera.transport(camera), self._shift(marks, camera)
-        covariance = update.covariance.corrected(*found.gain_root(), J, shift)
+        covariance = update.covariance.corrected(*found.gain(), J, shift)
         if not (covariance.P.diagonal()[HEAD:] > 0).all():
             raise LinAlgError("a landmark's variance would not stay positive")
         return replace(self, camera=camera, landmarks=marks, covariance=covariance)
