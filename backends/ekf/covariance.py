@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg.blas import dsyr2k, dsyrk
 
+from backends.ekf import kernels
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
 
@@ -24,7 +25,6 @@ CAMERA = 12  #: fixed: size of the camera's state [r, φ, v, ω]
 POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 RECENT = 4  #: cost: poses before the present one that are kept
 HEAD = CAMERA + POSE * RECENT  #: fixed: size of camera and last poses, behind which the landmarks stand
-_BLOCK = 64  # cost: rows that are mirrored at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,10 +89,14 @@ class Covariance:
 
     # --- the camera moves ---
 
-    def camera_moved(self, J: Array, noise: Array, by_error: Array | None = None) -> Covariance:
+    def camera_moved(
+        self, J: Array, noise: Array, by_error: Array | None = None, rows: IndexArray | None = None,
+        slide: Array | None = None,
+    ) -> Covariance:  # fmt: skip
         """The camera's error (12,) becomes J times what it was, plus noise (12, 12).
 
         With `by_error`, the pose before, that (6, 6) times [r, φ], is now the first of the last ones; the last goes.
+        Some landmarks in the state (`rows` (M,)) have more noise then, `slide` (M, 3, 3).
         """
         F = np.eye(HEAD) if by_error is None else np.eye(HEAD, k=-POSE)
         F[:CAMERA, :CAMERA] = J
@@ -104,17 +108,12 @@ class Covariance:
         own[:CAMERA, :CAMERA] += noise
         P[:HEAD, :HEAD] = 0.5 * (own + own.T)
         P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
+        if rows is not None and slide is not None:
+            at = self.numbers(rows)
+            P[at[:, :, None], at[:, None, :]] += slide
         return replace(self, P=P, by_rig=by_rig)
 
     # --- landmarks join and leave ---
-
-    def widened(self, rows: IndexArray, noise: Array) -> Covariance:
-        """With more noise (M, 3, 3) of some landmarks, by rows of the table."""
-        P, known, there = self.P.copy(), self.known.copy(), rows < self.correlated
-        at = self.numbers(rows[there])
-        P[at[:, :, None], at[:, None, :]] += noise[there]
-        known[rows[~there] - self.correlated] += noise[~there]
-        return replace(self, P=P, known=known)
 
     def appended(self, J: Array, noise: Array, by_rig: Array) -> Covariance:
         """With landmarks ``Y = g(r, φ) + noise`` (paper A, Eq. 10), by derivatives (M, 3, 6) and covariances (M, 3, 3).
@@ -133,10 +132,10 @@ class Covariance:
     def rearranged(self, rows: IndexArray, known: IndexArray) -> Covariance:
         """With other landmarks in each of its two parts, or fewer; by their rows of the table of landmarks."""
         joining = np.flatnonzero(rows >= self.correlated)
-        numbers = np.append(np.arange(HEAD), self.numbers(rows)).clip(max=len(self.P) - 1)
-        P = np.ascontiguousarray(self.P[numbers].T)[numbers]  # rows alone are copied fast
-        by_rig, at = self.by_rig[numbers], self.numbers(joining)
-        P[at], P[:, at], by_rig[at] = 0.0, 0.0, 0.0
+        numbers, at = np.append(np.arange(HEAD), self.numbers(rows)), self.numbers(joining)
+        numbers[at] = -1
+        P, by_rig = kernels.rearranged(self.P, numbers), self.by_rig[numbers]
+        by_rig[at] = 0.0
         P[at[:, :, None], at[:, None, :]] = self.known[rows[joining] - self.correlated]
         return replace(self, P=P, by_rig=by_rig, known=self.known[known - self.correlated])
 
@@ -157,7 +156,7 @@ class Covariance:
         last, by_rig, M = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), CAMERA))
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
         P = dsyrk(1.0, U, 1.0, P.T, overwrite_c=1).T if U.size else P
-        P[:CAMERA, :CAMERA] = mirrored(P[:CAMERA, :CAMERA])
+        kernels.mirror(P[:CAMERA, :CAMERA])
         M[:CAMERA], M[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
         half = 0.5 * M @ P[:CAMERA, :CAMERA]  # T = 1 + [M, 0]:  T P Tᵀ = P + M Yᵀ + Y Mᵀ,  Y = P[:, :12] + M P_cc / 2
         P = dsyr2k(1.0, M, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
@@ -165,7 +164,8 @@ class Covariance:
         P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]
         summands = self.P.diagonal() + 2 * (half * M).sum(axis=1)
         summands[last] = 0.0
-        return replace(self, P=positive(mirrored(P), summands, V.shape[1]), by_rig=by_rig)
+        kernels.mirror(P)
+        return replace(self, P=positive(P, summands, V.shape[1]), by_rig=by_rig)
 
     def displaced(self, rows: IndexArray, change: Array, shift: Array) -> Covariance:
         """After a change (M, 3) of some landmarks' coordinates that is none of their error, with a shift as above.
@@ -176,14 +176,6 @@ class Covariance:
         by_rig[self.numbers(rows).ravel(), -1:] -= change.reshape(-1, 1)
         nothing = np.zeros((len(self.P), 0))
         return replace(self, by_rig=by_rig).corrected(nothing, nothing, 0 * by_rig, np.eye(CAMERA), shift)
-
-
-def mirrored(P: Array) -> Array:
-    """P (n, n) with its lower triangle also above the diagonal, in place."""
-    for i in range(0, len(P), _BLOCK):
-        own, below = P[i : i + _BLOCK, i : i + _BLOCK], P[i + _BLOCK :, i : i + _BLOCK]
-        own[:], P[i : i + _BLOCK, i + _BLOCK :] = np.tril(own) + np.tril(own, -1).T, below.T
-    return P
 
 
 def positive(P: Array, summands: Array, terms: int) -> Array:

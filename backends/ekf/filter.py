@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from backends.ekf.camera import Camera, predicted
+from backends.ekf.camera import Camera, Motion, predicted
 from backends.ekf.covariance import CAMERA, POSE, RECENT, Covariance, positive
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
@@ -205,17 +205,16 @@ class LandmarkFilter:
     def _predicted(self, stamp: float, rests: bool) -> Prediction:
         """Go to a time, and say what is in the angle of view then; whether the camera rests meanwhile.
 
-        Features slide as the viewpoint changes: this widens the landmarks in view (`FilterState.slid`).
+        Features slide as the viewpoint changes: this widens the landmarks in view (`FilterState.advanced`).
         """
         s = self.state
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
-        if s.frame < 0:
-            after = replace(s, stamp=float(stamp), frame=0, closed=False)
-        else:
+        motion: Motion = s.camera, np.eye(CAMERA), np.zeros((CAMERA, CAMERA))
+        if s.frame >= 0:
             motion = predicted(s.camera, self.models, s.covariance.camera, stamp - s.stamp, rests)
-            after = s.advanced(float(stamp), motion)
-        T, rows = after.pose, self._measure.visible(after.pose, after.landmarks.points)
-        after = after.slid(self._coordinates, rows, self.models.slide.density / self._measure.stereo.f)
+        T = motion[0].pose
+        rows, density = self._measure.visible(T, s.landmarks.points), self.models.slide.density / self._measure.stereo.f
+        after = s.advanced(float(stamp), motion, self._coordinates, rows, density)
         marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
         by_pose = -toward @ (marks.gauge @ after.camera.displacement())  # (M, 3, 6), of them as seen from the camera

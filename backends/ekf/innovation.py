@@ -167,10 +167,15 @@ class Linearisation:
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
         return np.asarray(upper_inverse(upper).T)
 
+    @cached_property
+    def S_inverse(self) -> Array:
+        """``S⁻¹`` (3M, 3M)."""
+        return np.asarray(self.L_inverse.T @ self.L_inverse)
+
     def solved(self, used: BoolArray) -> Solution:
         """The update by some landmarks (mask (M,)). Raises LinAlgError if S is not positive definite."""
         out = np.flatnonzero(np.repeat(~used, 3))
-        Q = self.L_inverse.T @ self.L_inverse[:, out]
+        Q = self.S_inverse[:, out]
         root_inverse = np.linalg.inv(np.linalg.cholesky(Q[out]))
         return Solution(self, used, out, root_inverse, Q @ root_inverse.T)
 
@@ -192,8 +197,7 @@ class Solution:
 
     def weighted(self, X: Array) -> Array:
         """``S⁻¹ X`` of some columns (3M, ...) by what is used alone; zero in the rows of what is not."""
-        L_inverse = self.at.L_inverse
-        Y = L_inverse.T @ (L_inverse @ X) - self.E @ (self.E.T @ X)
+        Y = self.at.S_inverse @ X - self.E @ (self.E.T @ X)
         Y[self.out] = 0.0
         return np.asarray(Y)
 
@@ -234,6 +238,7 @@ class Solution:
         by_rig -= np.where(at.seen[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
         return V, at.HP.T @ self.E, at.HP.T @ self.weighted(by_rig)
 
+    @cached_property
     def distances(self) -> Array:
         """Squared distance (M,) of each landmark's measurement from what all others that are used predict.
 
@@ -241,16 +246,17 @@ class Solution:
         covariance ``Q_j⁻¹``: the distance is ``y_jᵀ Q_j⁻¹ y_j``. Those that are not used are off by ``C⁻ᵀ Eᵀ ν``, with
         covariance ``Q_bb⁻¹ = C⁻ᵀ C⁻¹``. A landmark that is not seen has distance 0.
         """
-        off, blocks = self.y.reshape(-1, 3).copy(), _blocks(self.at.L_inverse) - _blocks(self.E.T)
-        off[~self.used] = (self.at.nu @ self.E @ self.root_inverse).reshape(-1, 3)
-        blocks[~self.used] = _blocks(self.root_inverse)
+        E, root = self.E.reshape(len(self.used), 3, len(self.out)), self.root_inverse
+        off, blocks = self.y.reshape(-1, 3).copy(), diagonal_blocks(self.at.S_inverse) - E @ E.transpose(0, 2, 1)
+        off[~self.used] = (self.at.nu @ self.E @ root).reshape(-1, 3)
+        blocks[~self.used] = diagonal_blocks(root.T @ root)
         found = squared_distances(off, blocks)
         if not np.isfinite(found).all():
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
         return found
 
 
-def _blocks(A: Array) -> Array:
-    """Blocks (M, 3, 3) on the diagonal of ``Aᵀ A``, of A (·, 3M)."""
-    columns = A.reshape(len(A), A.shape[1] // 3, 3).transpose(1, 2, 0)
-    return np.asarray(columns @ columns.transpose(0, 2, 1))
+def diagonal_blocks(A: Array) -> Array:
+    """Blocks (M, 3, 3) on the diagonal of A (3M, 3M)."""
+    each = np.arange(len(A) // 3)
+    return np.asarray(A.reshape(len(each), 3, len(each), 3)[each, :, each])

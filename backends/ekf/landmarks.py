@@ -117,6 +117,12 @@ class FilterLandmarks(LandmarkRows):
         """No landmarks."""
         return cls.at(Euclidean(), np.zeros(0, np.int64), np.zeros((0, 3, 4)), np.zeros((0, 3)))
 
+    def angles(self, rows: IndexArray, at: Array) -> Array:
+        """Angles (M,) [rad] between the lines of sight of some rows at first, and from a position (3,)."""
+        first, now = self.points[rows] - self.anchors[rows, :, 3], self.points[rows] - at
+        cosine = (first * now).sum(axis=1) / np.sqrt((first**2).sum(axis=1) * (now**2).sum(axis=1))
+        return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
     def moved(self, coordinates: Coordinates, rows: IndexArray | slice, change: Array) -> FilterLandmarks:
         """With a change (M, 3) of the coordinates of some rows."""
         c, points, gauge, anchors = self.c.copy(), self.points.copy(), self.gauge.copy(), self.anchors[rows]

@@ -14,7 +14,7 @@ from numpy.linalg import LinAlgError
 from scipy.linalg.lapack import dpotrf
 
 from backends.ekf.covariance import HEAD, POSE
-from backends.ekf.innovation import Linearisation, Solution, Update
+from backends.ekf.innovation import Linearisation, Solution, Update, diagonal_blocks
 from slam.data import BoolArray
 from slam.geometry.se3 import Array
 from slam.window.gating import squared_distances
@@ -44,7 +44,7 @@ def gate(update: Update, T: Array | None = None) -> Gated:
     """
     at = update.linearised(None if T is None else update.camera.at(T))
     limits = update.measure.limits(update.z)
-    own = squared_distances(at.nu.reshape(-1, 3), _blocks(at.S))
+    own = squared_distances(at.nu.reshape(-1, 3), diagonal_blocks(at.S))
     if not np.isfinite(own).all():
         raise LinAlgError("the predicted innovations are not finite or not positive definite")
     distances = np.where(np.isfinite(at.z).all(axis=1), own, np.nan)
@@ -72,7 +72,7 @@ def _with_readmitted(gated: Gated) -> Solution | None:
     found = _agreeing(gated, gated.used)
     if found is not None:
         there = found.at.seen.any(axis=1) & np.isfinite(gated.distances)
-        more = ~found.used & there & (found.distances() <= gated.limits)
+        more = ~found.used & there & (found.distances <= gated.limits)
         found = (_agreeing(gated, found.used | more) or found) if more.any() else found
     return found
 
@@ -86,18 +86,12 @@ def _agreeing(gated: Gated, used: BoolArray) -> Solution | None:
     while used.any():
         found = _iterate(gated.at, used)
         used = found.used
-        excess = np.where(used, found.distances() / gated.limits, 0.0)
+        excess = np.where(used, found.distances / gated.limits, 0.0)
         worst = excess.max()
         if worst <= 1:
             return found if used.any() else None
         used = used & (excess <= max(1.0, 0.5 * worst))
     return None
-
-
-def _blocks(S: Array) -> Array:
-    """Blocks (M, 3, 3) on the diagonal of S (3M, 3M)."""
-    each = np.arange(len(S) // 3)
-    return np.asarray(S.reshape(len(each), 3, len(each), 3)[each, :, each])
 
 
 def _iterate(at: Linearisation, used: BoolArray) -> Solution:

@@ -44,36 +44,28 @@ class FilterState:
         P = J @ self.covariance.pose @ J.T
         return np.asarray(0.5 * (P + P.T))
 
-    def advanced(self, stamp: float, motion: Motion) -> FilterState:
-        """At a later time, after a motion of the camera."""
-        camera, J, noise = motion
-        covariance = self.covariance.camera_moved(J, noise, self.camera.by_error())
-        return replace(
-            self, stamp=stamp, frame=self.frame + 1, closed=False, camera=camera, covariance=covariance
-        )  # fmt: skip
-
-    def slid(self, coordinates: Coordinates, rows: IndexArray, density: float) -> FilterState:
-        """With the slide of some landmarks' features (rows (M,)), seen now from farther round than ever before.
+    def advanced(
+        self, stamp: float, motion: Motion, coordinates: Coordinates, rows: IndexArray, density: float
+    ) -> FilterState:
+        """At a later time, after a motion of the camera, which sees the landmarks of some rows (M,) then.
 
         A feature is found where the image looks like it; from another viewpoint that is another point of the surface. A
         landmark's direction walks at random with the angle between its lines of sight, by `density` [rad / √rad].
         """
-        if not density:
-            return self
-        marks, at = self.landmarks.select(rows), self.pose[:3, 3]
-        first, now = marks.points - marks.anchors[:, :, 3], marks.points - at
-        distance = np.linalg.norm(now, axis=1)
-        cosine = np.einsum("ni,ni->n", first, now) / (np.linalg.norm(first, axis=1) * distance)
-        turned = np.maximum(marks.turned, np.arccos(np.clip(cosine, -1.0, 1.0)))
-        more = turned - marks.turned
-        if not (more > 0).any():
-            return self
-        n = now / distance[:, None]
-        across = (density**2 * more * distance**2)[:, None, None] * (np.eye(3) - n[:, :, None] * n[:, None, :])
-        D, angles = coordinates.inverse_jacobian(marks.anchors, marks.c), self.landmarks.turned.copy()
-        angles[rows] = turned
-        covariance = self.covariance.widened(rows, D @ across @ D.transpose(0, 2, 1))
-        return replace(self, landmarks=replace(self.landmarks, turned=angles), covariance=covariance)
+        (camera, J, noise), landmarks, slide = motion, self.landmarks, None
+        if density:
+            turned = landmarks.angles(rows, camera.pose[:3, 3])
+            farther = turned > landmarks.turned[rows]
+            rows, turned = rows[farther], turned[farther]
+            marks, angles = landmarks.select(rows), landmarks.turned.copy()
+            sight = marks.points - camera.pose[:3, 3]
+            across = (sight**2).sum(axis=1)[:, None, None] * np.eye(3) - sight[:, :, None] * sight[:, None, :]
+            D = coordinates.inverse_jacobian(marks.anchors, marks.c)
+            slide = (density**2 * (turned - marks.turned))[:, None, None] * (D @ across @ D.transpose(0, 2, 1))
+            angles[rows] = turned
+            landmarks = replace(landmarks, turned=angles)
+        covariance = self.covariance.camera_moved(J, noise, self.camera.by_error(), rows, slide)
+        return FilterState(stamp, self.frame + 1, False, camera, landmarks, covariance)
 
     # --- landmarks join and leave ---
 
