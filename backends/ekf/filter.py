@@ -142,7 +142,7 @@ class LandmarkFilter:
         anchors[:, :, 3] = positions
         anchors[:, 2, 3] -= np.maximum(_STAND_OFF * np.sqrt(np.trace(covariances, axis1=1, axis2=2)), 1.0)
         new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, np.pi)
-        D = self._coordinates.inverse_jacobian(anchors, new.c)
+        D = new.gauge[:, :, :3]
         self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
 
     @one_blas_thread
@@ -214,7 +214,7 @@ class LandmarkFilter:
             motion = predicted(s.camera, self.models, s.covariance.camera, stamp - s.stamp, rests)
         T = motion[0].pose
         rows, density = self._measure.visible(T, s.landmarks.points), self.models.slide.density / self._measure.stereo.f
-        after = s.advanced(float(stamp), motion, self._coordinates, rows, density)
+        after = s.advanced(float(stamp), motion, rows, density)
         marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
         by_pose = -toward @ (marks.gauge @ after.camera.displacement())  # (M, 3, 6), of them as seen from the camera

@@ -168,14 +168,15 @@ class Linearisation:
         return np.asarray(upper_inverse(upper).T)
 
     @cached_property
-    def S_inverse(self) -> Array:
-        """``S⁻¹`` (3M, 3M)."""
-        return np.asarray(self.L_inverse.T @ self.L_inverse)
+    def information(self) -> Array:
+        """Blocks (M, 3, 3) on the diagonal of ``S⁻¹``."""
+        columns = self.L_inverse.reshape(len(self.L_inverse), len(self.z), 3).transpose(1, 2, 0)
+        return np.asarray(columns @ columns.transpose(0, 2, 1))
 
     def solved(self, used: BoolArray) -> Solution:
         """The update by some landmarks (mask (M,)). Raises LinAlgError if S is not positive definite."""
         out = np.flatnonzero(np.repeat(~used, 3))
-        Q = self.S_inverse[:, out]
+        Q = self.L_inverse.T @ self.L_inverse[:, out]
         root_inverse = np.linalg.inv(np.linalg.cholesky(Q[out]))
         return Solution(self, used, out, root_inverse, Q @ root_inverse.T)
 
@@ -197,7 +198,8 @@ class Solution:
 
     def weighted(self, X: Array) -> Array:
         """``S⁻¹ X`` of some columns (3M, ...) by what is used alone; zero in the rows of what is not."""
-        Y = self.at.S_inverse @ X - self.E @ (self.E.T @ X)
+        L_inverse = self.at.L_inverse
+        Y = L_inverse.T @ (L_inverse @ X) - self.E @ (self.E.T @ X)
         Y[self.out] = 0.0
         return np.asarray(Y)
 
@@ -247,7 +249,7 @@ class Solution:
         covariance ``Q_bb⁻¹ = C⁻ᵀ C⁻¹``. A landmark that is not seen has distance 0.
         """
         E, root = self.E.reshape(len(self.used), 3, len(self.out)), self.root_inverse
-        off, blocks = self.y.reshape(-1, 3).copy(), diagonal_blocks(self.at.S_inverse) - E @ E.transpose(0, 2, 1)
+        off, blocks = self.y.reshape(-1, 3).copy(), self.at.information - E @ E.transpose(0, 2, 1)
         off[~self.used] = (self.at.nu @ self.E @ root).reshape(-1, 3)
         blocks[~self.used] = diagonal_blocks(root.T @ root)
         found = squared_distances(off, blocks)

@@ -44,9 +44,7 @@ class FilterState:
         P = J @ self.covariance.pose @ J.T
         return np.asarray(0.5 * (P + P.T))
 
-    def advanced(
-        self, stamp: float, motion: Motion, coordinates: Coordinates, rows: IndexArray, density: float
-    ) -> FilterState:
+    def advanced(self, stamp: float, motion: Motion, rows: IndexArray, density: float) -> FilterState:
         """At a later time, after a motion of the camera, which sees the landmarks of some rows (M,) then.
 
         A feature is found where the image looks like it; from another viewpoint that is another point of the surface. A
@@ -60,7 +58,7 @@ class FilterState:
             marks, angles = landmarks.select(rows), landmarks.turned.copy()
             sight = marks.points - camera.pose[:3, 3]
             across = (sight**2).sum(axis=1)[:, None, None] * np.eye(3) - sight[:, :, None] * sight[:, None, :]
-            D = coordinates.inverse_jacobian(marks.anchors, marks.c)
+            D = marks.gauge[:, :, :3]
             slide = (density**2 * (turned - marks.turned))[:, None, None] * (D @ across @ D.transpose(0, 2, 1))
             angles[rows] = turned
             landmarks = replace(landmarks, turned=angles)
@@ -81,7 +79,7 @@ class FilterState:
             return self
         R, anchors = self.pose[:3, :3], np.repeat(self.pose[None, :3], len(h), axis=0)
         new = FilterLandmarks.at(coordinates, ids, anchors, self.pose[:3, 3] + h @ R.T)
-        D = coordinates.inverse_jacobian(anchors, new.c) @ R
+        D = new.gauge[:, :, :3] @ R
         noise = D @ covariances @ D.transpose(0, 2, 1)
         by_rig = np.zeros((len(h), 3, self.covariance.by_rig.shape[1])) if by_rig is None else D @ by_rig
         covariance = self.covariance.appended(new.gauge @ self.camera.displacement(), noise, by_rig)
