@@ -186,8 +186,9 @@ class MovingObjectDetector(ObjectDetector):
             body = self.bodies[body.id] = self._estimated(body, tracks, frame)
             mine = np.flatnonzero(tracks.body == body.id)
             tracks.position[mine] = transform(body.T, tracks.local[mine])
+        unfound = np.flatnonzero((tracks.number >= 0) & (tracks.row < 0))
         for column in (tracks.A, tracks.p, tracks.dof):  # what the slot held leaves the window
-            column[:, frame.slot] = 0
+            column[unfound, frame.slot] = 0
         record(tracks, np.flatnonzero(tracks.found), frame)
 
     def _estimated(self, body: Body, tracks: Tracks, frame: Frame) -> Body:

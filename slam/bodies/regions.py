@@ -117,14 +117,15 @@ def _new_regions(
     m: ConstantVelocity, spread: Array, radius: Array, rows: IndexArray, free: IndexArray
 ) -> list[Region]:  # fmt: skip
     """Regions of free tracks (K,) that lie together and move alike, the largest first: two at least."""
-    place, P, V = m.position[free], m.covariance[free], m.velocity_covariance[free]
-    alike = [
-        (squared_distances(place - place[i], spread[free] + P + P[i] + spread[free[i]]) < _NEAR)
-        & (squared_distances(m.velocity[free] - m.velocity[free[i]], V + V[i]) < AGREES)
-        for i in range(len(free))
-    ]
+    place, velocity, n = m.position[free], m.velocity[free], len(free)
+    P, V, S = m.covariance[free], m.velocity_covariance[free], spread[free]
+    apart = (place - place[:, None]).reshape(-1, 3), (S + P + P[:, None] + S[:, None]).reshape(-1, 3, 3)
+    faster = (velocity - velocity[:, None]).reshape(-1, 3), (V + V[:, None]).reshape(-1, 3, 3)
+    alike = (squared_distances(*apart) < _NEAR) & (squared_distances(*faster) < AGREES)
+    alike = alike.reshape(n, n)
+    size = alike.sum(axis=1)
     left, regions = np.ones(len(free), bool), []
-    for i in sorted(range(len(free)), key=lambda i: -int(alike[i].sum())):
+    for i in np.argsort(-size, kind="stable"):
         group = free[alike[i] & left]
         if left[i] and len(group) >= 2:
             left &= ~alike[i]

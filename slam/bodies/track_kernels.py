@@ -233,6 +233,24 @@ def squares(points, A):
 
 
 @kernel
+def expected_pixels(camera, T_world_left, position, covariance, rows, sigma):
+    """Pixels (M, 3) at which tracks are expected, NaN behind the camera, and their innovation covariances (M, 3, 3)."""
+    n = len(rows)
+    z, S, none = np.empty((n, 3)), np.empty((n, 3, 3)), np.zeros(3)
+    local, J, G = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    for m in range(n):
+        transform_back(T_world_left, position[rows[m]], local)
+        residual(camera, local, none, z[m], J)
+        for i in range(3):
+            z[m, i] = -z[m, i]
+            by_point(J[i], T_world_left, G[i])
+        turn(G, covariance[rows[m]], S[m])
+        for i in range(3):
+            S[m, i, i] += sigma * sigma
+    return z, S
+
+
+@kernel
 def points_on_rays(camera, T_world_left, points, measured, sigma, far, steps):
     """Points (N, 3) on the measured rays, their information (N, 3, 3), and numbers measured (N,).
 
