@@ -15,7 +15,7 @@ from slam.bodies.config import CLEAR, MIN_FRAMES
 from slam.bodies.track_kernels import windows_in_body
 from slam.data import BoolArray
 from slam.geometry.arrays import changed
-from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, transform
+from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, transform, twice
 from slam.models import ObjectModels
 from slam.object_data import MovingObject
 from slam.tracks.table import Tracks
@@ -131,8 +131,7 @@ def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
     T[:3, :3] = so3_exp(dt * body.velocity[:3]) @ T[:3, :3]
     T[:3, 3] += dt * body.velocity[3:]
     linear, angular = models.velocity_variance(dt)
-    R = np.zeros((6, 6))
-    R[:3, :3] = R[3:, 3:] = T[:3, :3].T
+    R = twice(T[:3, :3].T)
     velocity = body.velocity_covariance + np.diag([angular] * 3 + [linear] * 3)
     return body.placed(
         T, slot, False, T_before=body.T, covariance=body.covariance + dt**2 * R @ velocity @ R.T,

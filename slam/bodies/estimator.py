@@ -19,7 +19,7 @@ from slam.chi_square import chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, Observations, RecentPoses
 from slam.geometry.arrays import changed, isin
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig
-from slam.geometry.se3 import Array, adjoint, inverse, log, pose, so3_exp, so3_left_jacobian, so3_log, transform
+from slam.geometry.se3 import Array, adjoint, inverse, log, pose, so3_exp, so3_left_jacobian, so3_log, transform, twice
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.window import pose_only
@@ -142,7 +142,7 @@ class BodyEstimator:
             points=changed(b.points, unseen=b.points.unseen + 1),
         )  # fmt: skip
         by_step = adjoint(inverse(Y)) * dt
-        back = np.kron(np.eye(2), T[:3, :3].T)
+        back = twice(T[:3, :3].T)
         impulses = by_step * np.sqrt(np.repeat(self.models.velocity_variance(dt)[::-1], 3))
         covariance = by_step @ back @ b.estimate.velocity_covariance @ back.T @ by_step.T
         turn = Y[:3, :3].T @ b.poses[-2][:3, :3]

@@ -16,11 +16,11 @@ from slam.bodies.bodies import Body, in_body_axes, with_extent
 from slam.bodies.config import CLEAR, EXPLAINED, MIN_FRAMES, ROUNDS, RUN, WINDOW
 from slam.bodies.fits import fit_positions, times_vectors
 from slam.bodies.frame import Frame
-from slam.bodies.track_kernels import LEAST, RIDGE, inverses, squares, weighted_means
+from slam.bodies.track_kernels import LEAST, RIDGE, distances_from_box, inverses, squares, weighted_means
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.arrays import changed
-from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array, exp, points_by_pose, transform
 from slam.tracks.table import Tracks
 
 MARGIN = 0.25  # how far from a body's extent its further features may lie, as a share of the extent's diagonal
@@ -227,10 +227,10 @@ def distinctness(one: Body, ones: IndexArray, other: Body, others: IndexArray, t
 def _distances(body: Body, tracks: Tracks, rows: IndexArray, margin: float) -> Array:
     """Squared distances (N,) of tracks from a body's extent, widened by a share `margin`, in their own noise."""
     wider = margin * body.across
-    local = transform(inverse(body.T), tracks.position[rows])
-    away = (local - np.clip(local, body.lower - wider, body.upper + wider)) @ body.T[:3, :3].T
-    P = inverses(tracks.covariance[rows], RIDGE, LEAST)
-    return np.asarray((away * times_vectors(P, away)).sum(axis=1))
+    found: Array = distances_from_box(
+        body.T, body.lower - wider, body.upper + wider, tracks.position, tracks.covariance, rows
+    )
+    return found
 
 
 def _improve(body: Body, tracks: Tracks, slot: int) -> None:

@@ -229,6 +229,21 @@ def squares(points, A):
     return out
 
 
+@kernel
+def distances_from_box(T, lower, upper, position, covariance, rows):
+    """Squared distances (M,), in their own noise, of tracks from the box between two corners in a body's axes T."""
+    out, local, away, gap, P = np.empty(len(rows)), np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
+    for m in range(len(rows)):
+        transform_back(T, position[rows[m]], local)
+        for i in range(3):
+            away[i] = local[i] - min(max(local[i], lower[i]), upper[i])
+        for i in range(3):
+            gap[i] = row_times(T, i, away)
+        invert_symmetric(covariance[rows[m]], RIDGE * trace(covariance[rows[m]]) + LEAST, P)
+        out[m] = square(P, gap)
+    return out
+
+
 # ---------------------------------------------------------------------------------------------- pixels
 
 
