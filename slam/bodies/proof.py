@@ -22,7 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import fdtrc
+from scipy.special import chdtrc, fdtrc
 
 from slam.bodies.bodies import Body
 from slam.bodies.config import MIN_POINTS
@@ -110,10 +110,7 @@ def _evidence(chance: float) -> float:
 
 
 def _by_members(moved: Displacements, scene: Scene, by_rig: Array) -> tuple[float, float]:
-    """−log10 of the chance of so large a common motion of the members, and of such a turn, if they stand still.
-
-    F tests: their noise is known by their own scatter alone, which a few say badly.
-    """
+    """−log10 of the chance of so large a common motion of the members, and of such a turn, if they stand still."""
     J, dof = -moved.lag[:, None, None] * points_by_pose(moved.points), 3 * len(moved.d)
     JW = np.swapaxes(J, 1, 2) @ moved.W
     P = np.linalg.inv((JW @ J).sum(axis=0) + np.diag(PRIOR))
@@ -124,8 +121,8 @@ def _by_members(moved: Displacements, scene: Scene, by_rig: Array) -> tuple[floa
     covariance = max(scatter, 1.0) * P + scene.covariance
     covariance[3:, 3:] += np.outer(by_rig, by_rig)
     turn = motion[:3] @ np.linalg.solve(covariance[:3, :3], motion[:3])
-    way = motion @ np.linalg.solve(covariance, motion)
-    return _evidence(float(fdtrc(6, dof - 6, way / 6.0))), _evidence(float(fdtrc(3, dof - 6, turn / 3.0)))
+    motion_test = motion @ np.linalg.solve(covariance, motion)
+    return _evidence(float(chdtrc(6, motion_test))), _evidence(float(chdtrc(3, turn)))
 
 
 def _by_frames(places: Array, times: Array) -> float:
