@@ -62,7 +62,7 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
                 raise AnswerError(f"{where} must be an array of ids, got {value.dtype}")
             if name in _FINITE and not np.isfinite(value).all():
                 raise AnswerError(f"{where} is not finite")
-            if name in _POSES and not all(is_rigid(T, 1e-3) for T in value.reshape(-1, 4, 4)):
+            if name in _POSES and not is_rigid(value, 1e-3):
                 raise AnswerError(f"{where} is no rotation and translation")
             if name in _COVARIANCES and (value.diagonal(0, -2, -1) < -1e-9).any():  # 1e-9: rounding
                 raise AnswerError(f"{where} has a negative variance")
