@@ -26,7 +26,6 @@ _ROWS = 400  # poses that are looked at
 _EXPLAINS = 2.5  # times smaller errors become by a mistake that is named
 _LATEST, _STEP = 2.0, 0.05  # [s] of the shifts that are tried
 _APART_AT_LEAST = 5  # guard: motions one after the other, of which a shift cannot explain most by chance
-_BESIDE = 0.02  # [s] from a pose to the next true one, at most
 _FINE = 0.01  # errors of motions, as a share of them, below which nothing but a shift is looked for
 _MISFIT = 0.3  # errors of motions, as a share of them, that are no drift
 _APART = 0.8  # the same, that no noise of an estimated path explains
@@ -115,7 +114,7 @@ def truth_doubt(own: Trajectory, truth: Trajectory, noise: TruthNoise = _EXACT) 
 
 def _unexplained(own: Trajectory, truth: Trajectory, error: float) -> str:
     """What to say where no mistake explains why motions differ: of rotations alone, where positions agree."""
-    pairs = associate(own, truth)
+    pairs = _pairs(own, truth)
     extent = float(np.sqrt(3 * pairs[1].positions.var(axis=0).mean()))
     if error < _APART or absolute_errors(*pairs).rmse > _ALIKE * extent:
         return ""
@@ -133,7 +132,7 @@ def _shift(own: Trajectory, truth: Trajectory, free: str = "scale body") -> floa
     """The shift [s] by which the truth's stamps are late, if the best fit of what is `free` is right."""
     best, shift = _fit(own, truth, 0.0, free) or _Fit(np.inf, 1.0, 0.0, 0.0, 0), 0.0
     half = best.motions / 2
-    for step, reach in ((_STEP, _LATEST if free else 0.0), (_STEP / 10, _STEP)):
+    for step, reach in ((_STEP, _LATEST if free else 5 * _STEP), (_STEP / 10, _STEP)):
         for at in shift + np.arange(-reach, reach + step / 2, step):
             fit = _fit(own, truth, float(at), free)
             if fit is not None and fit.error < best.error and fit.motions > half:
@@ -143,9 +142,8 @@ def _shift(own: Trajectory, truth: Trajectory, free: str = "scale body") -> floa
 
 def _fit(own: Trajectory, truth: Trajectory, shift: float, free: str) -> _Fit | None:
     """The fit of what is `free`; None where too little is known, or the camera hardly moves."""
-    try:  # also between true poses as far apart as most are, or a shift would choose among the poses
-        between = float(np.median(np.diff(truth.stamps))) if len(truth) > 1 else 0.0
-        P, Q = associate(Trajectory(own.stamps + shift, own.poses), truth, max(between, _BESIDE))
+    try:
+        P, Q = _pairs(Trajectory(own.stamps + shift, own.poses), truth)
     except TrajectoryError:
         return None
     if len(P) <= _LEAST:
@@ -171,6 +169,11 @@ def _fit(own: Trajectory, truth: Trajectory, shift: float, free: str) -> _Fit | 
     error = float(np.hypot(_rms(off_t) / size, _rms(off_w) / turn))
     turned = float(np.degrees(np.linalg.norm(so3_log(R))))
     return _Fit(error, scale, turned, float(np.linalg.norm(lever)), len(A), size, turn)
+
+
+def _pairs(own: Trajectory, truth: Trajectory) -> tuple[Trajectory, Trajectory]:
+    """`associate`, also between true poses as far apart as most are: else a shift would choose among the poses."""
+    return associate(own, truth, max(0.02, float(np.median(np.diff(truth.stamps))) if len(truth) > 1 else 0.0))
 
 
 def _rms(vectors: Array) -> float:
