@@ -182,7 +182,7 @@ def _coloured(runs: Sequence[RunData]) -> list[tuple[RunData, str, float]]:
 
 
 def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
-    """The paths, in the world of the first run that has a truth, and the true one, where all have the same.
+    """The paths, in the world of the first run that has a truth, and its true one.
 
     From above, or from the side where the camera moves most up and down.
     """

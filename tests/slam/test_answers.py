@@ -53,13 +53,13 @@ def test_a_path_of_another_type_and_places_of_an_estimate_that_is_none_are_named
     """The first ended within this package; the second was laid to a method that a guarded class need not have."""
     system = StereoSlam(RIG, "surf", Changed("trajectory", lambda path: [path]))
     system.process(LEFT, RIGHT, 0.0)
-    with pytest.raises(SlamError, match="Changed.trajectory: must be of type Trajectory, got list"):
+    with pytest.raises(SlamError, match=r"Changed\.trajectory: must be of type Trajectory, got list"):
         system.trajectory()
     lost = load_script("docs/examples/pose_fit.py").PoseFit(RIG, models=EstimatorModels())
     lost.predict(0.0)
     lost.add(Observations(np.array([3]), np.array([[160.0, 120.0]]), np.array([[150.0, 120.0]])))
     lost._backend.points[3] = np.full(3, np.nan)
-    with pytest.raises(SlamError, match="^PoseFit.estimate: positions is not finite"):
+    with pytest.raises(SlamError, match=r"^PoseFit\.estimate: positions is not finite"):
         lost.positions(np.array([3]))
 
 
