@@ -33,11 +33,8 @@ from slam.version import __version__
 
 _MAGIC = "surf-stereo-slam map "
 _VERSION = 7  # fixed: of the file format
-_TEXTS = ("frontend", "world_frame", "written_by")  # of the header
+_TEXTS = ("frontend", "written_by")  # of the header
 _DATE = (1980, 1, 1, 0, 0, 0)  # fixed: NumPy's for all members, so that the same map gives the same bytes
-
-#: World frame of a map that was built from scratch.
-FIRST_FRAME = "left camera at the first frame"
 
 _LARGEST = 2**31  # bytes of a file
 _MOST_DIMENSIONS, _LONGEST = 4096, 1e6  # guard: of descriptors
@@ -110,7 +107,6 @@ class SavedMap:
         seen: number of frames in which each was measured (N,).
         in_view: number of frames in which each was detected or should have been (N,).
         frontend: name of the front end that the descriptors are from; empty where it is not known.
-        world_frame: what the world's axes are, in words.
         written_by: name and version of the program.
         seen_from: where the camera was when it saw each first (N, 3) [m] in the map's world frame; NaN where not known.
         source: where it was read from, for messages; not part of the map.
@@ -131,7 +127,6 @@ class SavedMap:
     seen: IdArray
     in_view: IdArray
     frontend: str = ""
-    world_frame: str = FIRST_FRAME
     written_by: str = ""
     source: str = "the map"
     seen_from: Array = field(default=None)  # type: ignore[arg-type]
@@ -164,7 +159,7 @@ class SavedMap:
         return len(self.ids)
 
     def __repr__(self) -> str:
-        return f"SavedMap({self.holds}, {self.dimensions}-D, {self.world_frame})"
+        return f"SavedMap({self.holds}, {self.dimensions}-D)"
 
     @property
     def holds(self) -> str:
@@ -192,7 +187,7 @@ class SavedMap:
 
     @classmethod
     def of(
-        cls, landmarks: LandmarkTable, estimate: Estimate, frontend: str, world_frame: str, atlas: Atlas,
+        cls, landmarks: LandmarkTable, estimate: Estimate, frontend: str, atlas: Atlas,
         rig: StereoRig,
     ) -> SavedMap:  # fmt: skip
         """The map of a running system: landmark rows, the back end's estimate, what both belong to, and keyframes."""
@@ -200,7 +195,7 @@ class SavedMap:
         P = definite(estimate.covariances)
         return cls(
             estimate.ids.astype(np.int64), estimate.positions, P, landmarks.descriptors.astype(np.float32),
-            landmarks.laplacian.astype(np.int8), landmarks.seen, landmarks.in_view, frontend, world_frame,
+            landmarks.laplacian.astype(np.int8), landmarks.seen, landmarks.in_view, frontend,
             f"surf-stereo-slam {__version__}", seen_from=landmarks.seen_from,
             keyframes=atlas.keyframes, keyframe_poses=atlas.poses_in_map, loops=atlas.loops,
             rig=np.array([numbers[name] for name in _RIG]),

@@ -30,7 +30,7 @@ def some_map(count=20, dimensions=16):
     return SavedMap(
         np.arange(count) * 2, rng.standard_normal((count, 3)), np.tile(0.01 * np.eye(3), (count, 1, 1)),
         (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32), np.ones(count, np.int8),
-        np.arange(count), np.arange(count) + 1, "surf", "somewhere", "a test",
+        np.arange(count), np.arange(count) + 1, "surf", "a test",
     )  # fmt: skip
 
 

@@ -4,10 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from slam.config import SystemConfig
-from slam.geometry.trajectory import TruthNoise
+from slam.geometry.se3 import exp
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.run.options import RunOptions
+from slam.run.plots import draw_paths
 from slam.run.run_data import RunData, pose_errors
 from slam.run.runner import run
 from slam.sequences import open_sequence
@@ -21,6 +24,18 @@ def finished(tmp_path_factory):
     folder, config = tmp_path_factory.mktemp("run"), SystemConfig.for_kind("handheld")
     run(open_sequence(WORLD), RunOptions("ekf", "surf", config, folder))
     return RunData.read(folder, "a")
+
+
+def test_a_true_path_is_drawn_where_all_runs_have_the_same(finished):
+    truth = finished.truth
+    elsewhere = replace(finished, truth=Trajectory(truth.stamps, truth.poses @ exp(np.ones(6))))
+    later = {name: Trajectory(truth.stamps + 9, getattr(finished, name).poses) for name in ("online", "truth")}
+    part = replace(finished, truth=truth.select(np.arange(3)))
+    for other, same in ((finished, True), (part, True), (elsewhere, False), (replace(finished, **later), False)):
+        axis = Figure().subplots()
+        draw_paths(axis, [finished, other])
+        labels = [text.get_text() for text in axis.get_legend().get_texts()]
+        assert ("true path" in labels) == same == ("true paths differ" not in axis.get_title())
 
 
 def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(finished):
