@@ -13,6 +13,7 @@ import numpy as np
 from slam.checks import LATEST_STAMP, is_rigid
 from slam.data import Estimate, Patches, Prediction, RecentPoses, UpdateReport, UpdateStatus
 from slam.errors import AnswerError, PartError, SlamError, cause
+from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, RecentBackend
 
 _OURS = ("slam", "backends", "frontends", "builtins")
@@ -28,6 +29,7 @@ _ANSWERS: dict[str, tuple[type, dict[str, Any]]] = {
     "estimate": (Estimate, {**_POSE, "positions": ("n", 3), "covariances": ("n", 3, 3)}),
     "recent": (RecentPoses, {"stamps": ("k",), "poses": ("k", 4, 4), "covariance": ("6k", "6k")}),
     "positions": (np.ndarray, {"real": ("n", 3)}),
+    "trajectory": (Trajectory, {}),  # which checks itself
     "patches": (Patches, {"images": ("n", "s", "s"), "centres": ("n", 2), "size": ("n",)}),
     "align": (tuple, {}),
 }

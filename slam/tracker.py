@@ -85,7 +85,7 @@ class State:
 
     def path(self) -> Trajectory:
         """The path by all back ends so far, in their frame."""
-        return Trajectory.joined([*self.past, self.backend.trajectory()])
+        return Trajectory.joined([*self.past, checked(self.backend, "trajectory", self.backend.trajectory())])
 
 
 @dataclass(frozen=True, eq=False)
