@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from slam.config import SystemConfig
-from slam.data import StereoFeatures
 from slam.geometry import se3
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
@@ -46,20 +45,6 @@ def right_share(results, points):
         total += len(result.matched)
         owner.update({i: ids[row] for i, row in zip(result.added.tolist(), result.added_features)})
     return right / total
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_two_seconds_of_blackout(backend):
-    poses = path(95)
-    dark = lambda k, f: StereoFeatures.empty(f.stamp, 32) if 20 <= k < 80 else f  # noqa: E731
-    system, results, points = run(backend, poses, dark)
-    lost = CONFIG.map.lost_after - 1
-    assert states(results)[:4] == [("started", 1), ("tracked", 19), ("predicted", lost), ("lost", 60 - lost)]
-    assert states(results)[4] == ("tracked", 15)
-    assert not any(len(r.added) for r in results[20:80])
-    assert right_share(results, points) == 1
-    assert np.linalg.norm(system.trajectory().positions[-1] - poses[-1][:3, 3]) < 0.012
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
