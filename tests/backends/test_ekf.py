@@ -42,18 +42,6 @@ def test_wrong_options_are_refused():
         EkfBackend(RIG, papers=True, iterations=2)
 
 
-def test_removed_landmarks_change_nothing_else(drive):
-    backend = EkfBackend(RIG, MODELS)
-    run(backend, drive)
-    before = backend.estimate()
-    gone = before.ids[[0, 20, -1]]
-    backend.remove(gone)
-    after, kept = backend.estimate(), ~np.isin(before.ids, gone)
-    np.testing.assert_array_equal(after.positions, before.positions[kept])
-    np.testing.assert_array_equal(after.covariances, before.covariances[kept])
-    np.testing.assert_array_equal(backend.positions(after.ids), after.positions)
-
-
 # --- consistency ---
 
 
