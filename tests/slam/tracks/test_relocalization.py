@@ -19,17 +19,12 @@ MAP = MapConfig(target_in_view=40, max_depth_error=0.3, restart_after=12)
 CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5), map=MAP)
 
 
-def run(backend, poses, change=lambda k, features: features, cloud=None, config=CONFIG):
-    cloud = cloud or Cloud(150)
-    system = StereoSlam(RIG, None, backend, config=config)
-    results, points = [], []
+def run(backend, poses):
+    cloud, system, results, points = Cloud(150), StereoSlam(RIG, None, backend, config=CONFIG), [], []
     for k, T in enumerate(poses):
-        if T is None:
-            continue
         features, ids = cloud.features(T, k / 30, 0.3)
-        changed = change(k, features)
-        results.append(system.process_features(changed))
-        points.append(ids if len(changed) else ids[:0])
+        results.append(system.process_features(features))
+        points.append(ids)
     return system, results, points
 
 
