@@ -52,6 +52,20 @@ def test_an_allowed_place_is_believed_at_once_where_landmarks_are_found_around_i
     assert np.abs(se3.log(se3.inverse(T_TRUE) @ found.T_world_left)).max() < 0.01
 
 
+@pytest.mark.parametrize("far", [True, False])
+def test_other_places_wait_for_several_frames(far):
+    """Far beyond what the prediction allows; or allowed, where no landmark is found."""
+    shift = se3.exp(np.array([0, 0, 0, 1.0, 0.8, 0])) if not far else np.eye(4)
+    tracking = TrackingState()
+    for frame in range(AssociationConfig().kidnapped_after):
+        landmarks, positions, features = scene(frame)
+        expected = prediction(positions, 0.2 if not far else 0.005, 400.0)
+        assert (jump(expected, T_TRUE @ shift) > AssociationConfig().max_jump) == far
+        found, tracking = search(expected, landmarks, positions, features).localize(tracking, lambda: T_TRUE @ shift)
+        assert not len(found)
+        assert found.kidnapped == (frame == AssociationConfig().kidnapped_after - 1)
+
+
 @pytest.mark.parametrize(("shown", "frames"), [(60, 1), (2, AssociationConfig().kidnapped_after)])
 def test_few_landmarks_of_long_ago_count_when_several_frames_show_them(shown, frames):
     """A few out of many agree by chance with the pose that all others give, as if the path had no drift."""
