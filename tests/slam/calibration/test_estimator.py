@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.calibration import RigModel, SelfCalibration, SelfCalibrationConfig
+from slam.calibration import RigCorrection, RigModel, RigPosterior, SelfCalibration, SelfCalibrationConfig
 from slam.calibration.posterior import prior_information
+from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry import se3
+from slam.system import StereoSlam
 from tests.slam.calibration.drives import CAR, Street, disparity_error, drive, parameters, pose, residual_fields
-from tests.slam.scene import GENERAL_RIG
+from tests.slam.scene import GENERAL_RIG, RIG, Cloud
 
 #: A turn of the right camera after a knock [rad].
 TURNED = parameters(pitch=5e-4, yaw=5e-4, roll=5e-4)
@@ -167,3 +169,38 @@ def test_a_change_that_does_not_count_is_not_applied():
     revision = calibration.apply()
     np.testing.assert_array_equal(revision.after.parameters, calibration.posterior.mean)
     assert calibration.apply() is None
+
+
+@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
+def test_a_revision_does_not_move_the_camera(backend):
+    """Landmarks follow the new correction: else a sudden change of all pixels looks like motion.
+
+    A revision moves the past: the newest pose is to the last digit where it was, also for whoever reads poses live.
+    """
+    correction = RigCorrection(RigModel(RIG), parameters(left_k1=-0.05, right_k1=-0.05, right_cx=1e-3))
+    cloud, truth = Cloud(150, seed=2), [se3.exp(np.array([0, 0, 0, 0, 0, 0.01 * k])) for k in range(12)]
+    system = StereoSlam(RIG, None, backend, config=SystemConfig().with_settings(["map.max_depth_error=0.3"]))
+    system.calibration.observe = lambda *_: None
+    revise, moved = system.backend.revise, []
+
+    def watched(correct):
+        pose = system.backend.estimate(landmarks=False).T_world_left
+        revise(correct)
+        moved.append(np.abs(system.backend.estimate(landmarks=False).T_world_left - pose).max())
+
+    system.backend.revise = watched
+    for k, T in enumerate(truth):
+        f = cloud.features(T, k / 30, 0.05)[0]
+        z = correction.undone(np.column_stack([f.uv_left, f.uv_right[:, 0]]))
+        wrong = replace(f, uv_left=z[:, :2], uv_right=np.column_stack([z[:, 2], z[:, 1]]))
+        if k == 8:
+            tight = 1e-4 * system.calibration._own.covariance
+            system.calibration._own = RigPosterior(correction.parameters, tight)
+            system.calibration._motion_agrees = lambda: True
+        before = system.estimate().T_world_left if k else np.eye(4)
+        result = system.process_features(wrong)
+        assert (result.revision is not None) == (k == 8)
+        if k == 8:
+            step = np.linalg.norm((np.linalg.inv(before) @ result.estimate.T_world_left)[:3, 3])
+            assert abs(step - 0.01) < 0.01
+    assert moved == [0.0]
