@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -189,3 +192,52 @@ def test_a_map_that_begins_where_nobody_knows_how_the_camera_is_turned(name, opt
         begun.add((backend._state if name == "window" else backend.state).begun)
     assert steps_off(found, poses) < (0.08 if name == "window" else 0.1) and len(begun) <= 2, begun
     assert rejected < 60 or name == "window"
+
+
+def interrupt(call, number: int) -> bool:
+    """Whether a call was interrupted at the `number`-th function called within the back ends."""
+    left = number
+
+    def profile(frame, event, _):
+        nonlocal left
+        if event == "call" and "backends/" in frame.f_code.co_filename.replace("\\", "/").split("tests")[0]:
+            left -= 1
+            if not left:
+                raise KeyboardInterrupt
+
+    before = sys.getprofile()
+    sys.setprofile(profile)
+    try:
+        call()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.setprofile(before)
+    return False
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # interrupted while a generator closes
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("ekf", {}), ("iekf", {}), ("smoother", {"lag": None}), ("smoother", {"lag": 12}), ("window", {})],
+)
+def test_a_call_that_is_interrupted_did_not_happen(name, options):
+    """A KeyboardInterrupt at any function call within a back end: the same call again, and the run goes on."""
+    data = scene(path(20, 0.1, np.array([0.0, 0.0, 0.8]), np.array([0.0, 0.3, 0.0])), points=150)
+    models, rng, known, count = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5), np.random.default_rng(0), [], 0
+    often, plain = (backends.create(name, RIG, models=models, **options) for _ in range(2))
+    for k, (stamp, _, seen) in enumerate(data):
+        old = np.isin(seen.ids, known)
+        gone = rng.permutation(np.setdiff1d(known, seen.ids))[:3].astype(np.int64)
+        calls = ("predict", stamp), ("update", seen.select(old)), ("add", seen.select(~old)), ("remove", gone)
+        for method, argument in (*calls, ("estimate", True), ("revise", lambda z: z)):
+            for backend in (often, plain):
+                call = partial(getattr(backend, method), argument)
+                if backend is plain or k < 3 or interrupt(call, int(rng.integers(1, 60))):
+                    count += backend is often and k > 2
+                    call()
+        known = np.setdiff1d(np.union1d(known, seen.ids), gone)
+        assert len(often.trajectory()) == k + 1
+    assert count > 20
+    off = se3.log(se3.inverse(plain.trajectory().poses) @ often.trajectory().poses)
+    assert np.abs(off).max() < (0.01 if name == "smoother" else 1e-12)  # its graph was built anew, linearised elsewhere
