@@ -17,6 +17,7 @@ from slam.models import EstimatorModels, MotionModel, SlideModel, models_for
 from tests.backends.ekf_runs import (
     FORWARD,
     MODELS,
+    ROLL,
     STILL,
     YAW,
     dense,
@@ -26,7 +27,7 @@ from tests.backends.ekf_runs import (
     turning_drive,
 )
 from tests.backends.hostile_calls import play
-from tests.backends.scenes import RIG, Scene, cloud, observe, path, scene, step
+from tests.backends.scenes import RIG, Scene, cloud, observe, path, run, scene, step
 
 # --- gaps and turns ---
 
@@ -36,6 +37,16 @@ BOTH = pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "i
 @pytest.fixture(scope="module")
 def drive() -> Scene:
     return turning_drive()
+
+
+@pytest.mark.parametrize("rate", [YAW, ROLL, np.array([0.6, 0.6, 0.6])], ids=["heading", "roll", "all"])
+def test_the_angles_singularity_is_harmless(rate):
+    data = scene(path(70, 0.1, 0.2 * FORWARD, rate), points=1000)  # turns by 400 degrees
+    backend = EkfBackend(RIG, MODELS)
+    reports = run(backend, data)
+    assert errors(backend, data.poses).max() < 0.03
+    assert nees(backend, data.poses[-1]) < chi2.ppf(0.9999, 6)
+    assert sum(len(r.rejected) for r in reports) < 10
 
 
 @BOTH

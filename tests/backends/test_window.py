@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import backends
-from experiments.long_run import DT, Corridor, measured
+from experiments.long_run import DT, MODELS, Corridor, measured
+from experiments.long_run import RIG as WALK
 from experiments.long_run import run as run_long
 from slam.data import Observations
 from slam.geometry import se3
@@ -72,6 +73,21 @@ def test_memory_does_not_grow_with_the_run():
     first, *_, last = run_long("window", 2400, 400, Corridor(density=4, speed=2.0))
     assert last.frame - first.frame == 2000
     assert 1e6 * (last.beyond - first.beyond) < 4096 * 2000
+
+
+def test_a_rig_whose_errors_move_nothing_changes_no_byte():
+    """Consider columns stand beside the estimate: they take no part in its arithmetic."""
+    found = []
+    for field in (None, lambda z: np.zeros((*z.shape, 5))):
+        backend = backends.create("window", WALK, models=MODELS)
+        if field is not None:
+            backend.consider(field)
+        walk(backend, 0, 40, np.random.default_rng(0), set())
+        found.append((backend.estimate(), backend.trajectory()))
+    (mine, path), (its, other) = found
+    for name in ("T_world_left", "covariance", "positions", "covariances"):
+        np.testing.assert_array_equal(getattr(mine, name), getattr(its, name))
+    np.testing.assert_array_equal(path.poses, other.poses)
 
 
 def test_a_revision_that_takes_a_depth_away_leaves_a_path():
