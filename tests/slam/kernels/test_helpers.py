@@ -7,7 +7,8 @@ import pytest
 
 from slam.geometry import se3 as reference
 from slam.geometry.rig import StereoRig
-from slam.kernels import se3
+from slam.kernels import linear, se3
+from tests.slam.numeric import positive
 
 RIG = StereoRig.rectified_pair(450.0, 320.0, 240.0, 0.12, 640, 480, doffs=3.0)
 CAMERA = RIG.rectified_parameters
@@ -34,6 +35,17 @@ def filled(helper, *arguments, shape):
     out = np.full(shape, 7.0)
     call(helper, *arguments, out)
     return out
+
+
+def test_whitening(rng):
+    C, g = positive(3, rng), rng.normal(size=3)
+    W = filled(linear.whitener, C, shape=(3, 3))
+    np.testing.assert_allclose(W, np.linalg.inv(np.linalg.cholesky(C)), rtol=1e-12, atol=1e-14)
+    assert call(linear.squared_distance, g, C) == pytest.approx(g @ np.linalg.solve(C, g), rel=1e-12)
+    assert np.isnan(call(linear.squared_distance, g, -C))
+    left = np.array([*g[:2], np.nan])
+    assert call(linear.squared_distance, left, C) == pytest.approx(g[:2] @ np.linalg.solve(C[:2, :2], g[:2]), rel=1e-12)
+    assert np.isnan(filled(linear.whitener, np.diag([1.0, -1.0, 1.0]), shape=(3, 3))[1, 1])
 
 
 @pytest.mark.parametrize("turn", STEPS)
