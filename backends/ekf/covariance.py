@@ -96,7 +96,7 @@ class Covariance:
         """The camera's error (12,) becomes J times what it was, plus noise (12, 12).
 
         With `by_error`, the pose before, that (6, 6) times [r, φ], is now the first of the last ones; the last goes.
-        Some landmarks in the state (`rows` (M,)) have more noise then, `slide` (M, 3, 3).
+        Some landmarks (`rows` (M,) of the table) have more noise then, `slide` (M, 3, 3).
         """
         F = np.eye(HEAD) if by_error is None else np.eye(HEAD, k=-POSE)
         F[:CAMERA, :CAMERA] = J
@@ -108,10 +108,13 @@ class Covariance:
         own[:CAMERA, :CAMERA] += noise
         P[:HEAD, :HEAD] = 0.5 * (own + own.T)
         P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
+        known = self.known
         if rows is not None and slide is not None:
-            at = self.numbers(rows)
-            P[at[:, :, None], at[:, None, :]] += slide
-        return replace(self, P=P, by_rig=by_rig)
+            there, known = rows < self.correlated, known.copy()
+            at = self.numbers(rows[there])
+            P[at[:, :, None], at[:, None, :]] += slide[there]
+            known[rows[~there] - self.correlated] += slide[~there]
+        return Covariance(P, by_rig, known)
 
     # --- landmarks join and leave ---
 

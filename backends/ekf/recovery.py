@@ -33,12 +33,12 @@ def agreement(update: Update, guess: Array | None, search: Search) -> Solution |
 
     It is linearised at the prior, then at the guess, a pose (4, 4), if there is one. Where less than a third of the
     observations agrees, and as many wrong ones might agree by chance, that agreement is ignored: it could move the pose
-    anywhere. An agreement of a minority counts only if nothing else is found. `search` is only called where nothing
-    else helps. Raises LinAlgError where the reason is numerical.
+    anywhere. An agreement of a minority counts only if nothing else is found; of two, the larger. `search` is only
+    called where nothing else helps. Raises LinAlgError where the reason is numerical.
     """
     if not (np.isfinite(update.camera.pose).all() and math.isfinite(update.covariance.P.trace())):
         raise LinAlgError("the predicted state is not finite")
-    found, error, majority = None, None, (len(update.z) + 1) // 2
+    minorities, error, majority = [], None, (len(update.z) + 1) // 2
     for T in (None,) if guess is None else (None, guess):
         try:
             agreed = _agreed(gate(update, T))
@@ -47,11 +47,11 @@ def agreement(update: Update, guess: Array | None, search: Search) -> Solution |
             continue
         if agreed is not None and agreed.used.sum() >= majority:
             return agreed
-        found = agreed or found
-    found = _restarted(update, search, max(MIN_CONSENSUS, majority)) or found
-    if found is None and error is not None:
+        minorities += [] if agreed is None else [agreed]
+    found = _restarted(update, search, max(MIN_CONSENSUS, majority))
+    if found is None and not minorities and error is not None:
         raise error
-    return found
+    return found or max(minorities, key=lambda one: one.used.sum(), default=None)
 
 
 def _restarted(update: Update, search: Search, least: int) -> Solution | None:
@@ -74,10 +74,9 @@ def _restarted(update: Update, search: Search, least: int) -> Solution | None:
 def _agreed(gated: Gated) -> Solution | None:
     """What agrees with a prediction, if it is more than might agree by chance at the gate's own level."""
     found = solve(gated)
-    used, count = 0 if found is None else int(found.used.sum()), len(gated.used)
-    if count < MIN_OBSERVATIONS or ONE_AGREES_IN * used >= count:
+    agreed = np.zeros_like(gated.used) if found is None else found.used
+    if len(agreed) < MIN_OBSERVATIONS or ONE_AGREES_IN * agreed.sum() >= len(agreed):
         return found
-    rejected = gated.distances[~gated.used & np.isfinite(gated.distances)]
-    probability = gated.at.update.measure.models.gate_probability
-    chance = by_chance(rejected, used, count, float(gated.limits.max()), probability)
+    update = gated.at.update
+    chance = by_chance(update.z, agreed, gated.distances, update.measure.models.gate_probability)
     return None if chance else found

@@ -44,24 +44,29 @@ class FilterState:
         P = J @ self.covariance.pose @ J.T
         return np.asarray(0.5 * (P + P.T))
 
-    def advanced(self, stamp: float, motion: Motion, rows: IndexArray, density: float) -> FilterState:
+    def advanced(
+        self, stamp: float, motion: Motion, rows: IndexArray, density: float, unknown: float = 0.0, least: float = 0.0
+    ) -> FilterState:
         """At a later time, after a motion of the camera, which sees the landmarks of some rows (M,) then.
 
         A feature is found where the image looks like it; from another viewpoint that is another point of the surface. A
-        landmark's direction walks at random with the angle between its lines of sight, by `density` [rad / √rad].
+        landmark's direction walks at random with the angle between its lines of sight, by `density` [rad / √rad]; where
+        the earlier one is not known, as of a prior map, by as much as with an angle `unknown` [rad]. Angles of less
+        than `least` [rad] wait: a camera that stands seems to turn to and fro.
         """
         (camera, J, noise), landmarks, slide = motion, self.landmarks, None
         if density:
-            turned = landmarks.angles(rows, camera.pose[:3, 3])
-            farther = turned > landmarks.turned[rows]
-            rows, turned = rows[farther], turned[farther]
-            marks, angles = landmarks.select(rows), landmarks.turned.copy()
-            sight = marks.points - camera.pose[:3, 3]
-            across = (sight**2).sum(axis=1)[:, None, None] * np.eye(3) - sight[:, :, None] * sight[:, None, :]
-            D = marks.gauge[:, :, :3]
-            slide = (density**2 * (turned - marks.turned))[:, None, None] * (D @ across @ D.transpose(0, 2, 1))
-            angles[rows] = turned
-            landmarks = replace(landmarks, turned=angles)
+            sight, sights = landmarks.points[rows] - camera.pose[:3, 3], landmarks.sights.copy()
+            distance = np.linalg.norm(sight, axis=1, keepdims=True)
+            cosine = (sight / distance * sights[rows]).sum(axis=1)
+            angle = np.where(np.isnan(cosine), unknown, np.arccos(np.clip(cosine, -1.0, 1.0)))
+            some = angle > least
+            rows, sight, distance, angle = rows[some], sight[some], distance[some], angle[some]
+            across = (distance**2)[:, :, None] * np.eye(3) - sight[:, :, None] * sight[:, None, :]
+            D = landmarks.gauge[rows, :, :3]
+            slide = (density**2 * angle)[:, None, None] * (D @ across @ D.transpose(0, 2, 1))
+            sights[rows] = sight / distance
+            landmarks = replace(landmarks, sights=sights)
         covariance = self.covariance.camera_moved(J, noise, self.camera.by_error(), rows, slide)
         return FilterState(stamp, self.frame + 1, False, camera, landmarks, covariance)
 
