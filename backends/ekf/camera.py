@@ -86,21 +86,21 @@ def predicted(camera: Camera, models: EstimatorModels, P: Array, dt: float, rest
         return camera.stopped(), _AT_REST, np.zeros_like(P)
     if _any_attitude(models, P, dt):
         sigmas = min(models.initial_velocity_sigma * dt, ANYWHERE), np.pi / np.sqrt(3), *_velocity_sigmas(models)
-        return camera.stopped(), _POSITION, camera.of_body(_diagonal(sigmas))
+        return camera.stopped(), _POSITION, camera.of_body(diagonal(sigmas))
     camera, A, W = camera.advanced(dt)
     return camera, A, (W * np.repeat(models.motion.velocity_variance(dt), 3)) @ W.T
 
 
 def prior(models: EstimatorModels) -> Array:
     """The first camera's covariance (12, 12) of position, attitude, velocity, and body rate."""
-    return _diagonal((models.initial_position_sigma, models.initial_rotation_sigma, *_velocity_sigmas(models)))
+    return diagonal((models.initial_position_sigma, models.initial_rotation_sigma, *_velocity_sigmas(models)))
 
 
 def _velocity_sigmas(models: EstimatorModels) -> tuple[float, float]:
     return models.initial_velocity_sigma, models.initial_angular_velocity_sigma
 
 
-def _diagonal(sigmas: Sequence[float]) -> Array:
+def diagonal(sigmas: Sequence[float]) -> Array:
     """Covariance (12, 12) of three numbers for each of four standard deviations."""
     return np.diag(np.repeat(np.array(sigmas) ** 2, 3))
 

@@ -12,7 +12,7 @@ from backends.ekf.camera import Camera, Motion, predicted
 from backends.ekf.covariance import CAMERA, POSE, RECENT, Covariance, positive
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
-from backends.ekf.recovery import agreement
+from backends.ekf.solve import agreement
 from backends.ekf.state import FilterState
 from slam.checks import known_landmarks, require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
@@ -85,9 +85,9 @@ class LandmarkFilter:
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         s = self._started("update")
-        require_not_measured(self.name, s.closed)
+        require_not_measured(self.name, s.measured)
         require_guess(self.name, guess)
-        s = replace(s.with_all_of(observations.ids), closed=True)
+        s = replace(s.with_all_of(observations.ids), measured=True)
         s, report = self._updated(s, observations, guess)
         self.state = s
         return report
@@ -190,7 +190,7 @@ class LandmarkFilter:
         were corrected before, and seen at pixels as they are now, would look as if the camera had moved. Those of a
         prior map that were not measured yet were placed by no pixels: they stay.
         """
-        s, stereo = replace(self.state, closed=True), self._measure.stereo
+        s, stereo = replace(self.state, measured=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
             z, _ = stereo.project(se3.transform(se3.inverse(s.pose), s.landmarks.points))
             rows = np.flatnonzero(self.rig.left.in_image(z[:, :2])[: s.covariance.correlated])

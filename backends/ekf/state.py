@@ -21,7 +21,7 @@ class FilterState:
 
     stamp: float  # time [s]; NaN before the first prediction
     frame: int  # number of the prediction, −1 before the first
-    closed: bool  # whether the pose may not be updated any more
+    measured: bool  # whether the pose may not be updated any more
     camera: Camera
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of everything
@@ -90,7 +90,7 @@ class FilterState:
         covariance = self.covariance.appended(new.gauge @ self.camera.displacement(), noise, by_rig)
         end = self.covariance.correlated
         landmarks = self.landmarks.select(slice(end)).joined(new).joined(self.landmarks.select(slice(end, None)))
-        return replace(self, closed=True, landmarks=landmarks, covariance=covariance)
+        return replace(self, measured=True, landmarks=landmarks, covariance=covariance)
 
     def inserted(self, new: FilterLandmarks, covariances: Array) -> FilterState:
         """With landmarks known from elsewhere, by covariances (M, 3, 3) of their coordinates."""
