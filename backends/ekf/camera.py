@@ -9,7 +9,7 @@ much says `Camera.displacement`. What a displacement of the world changes in a l
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -100,7 +100,7 @@ def _velocity_sigmas(models: EstimatorModels) -> tuple[float, float]:
     return models.initial_velocity_sigma, models.initial_angular_velocity_sigma
 
 
-def diagonal(sigmas: Sequence[float]) -> Array:
+def diagonal(sigmas: Sequence[Any]) -> Array:
     """Covariance (12, 12) of three numbers for each of four standard deviations."""
     return np.diag(np.repeat(np.array(sigmas) ** 2, 3))
 

@@ -183,7 +183,7 @@ class Covariance:
 
 
 @kernel
-def mirror(P):
+def mirror(P: Array) -> None:
     """The lower triangle of P (n, n) also above its diagonal, in place."""
     n = len(P)
     for first in range(0, n, _BLOCK):
@@ -194,7 +194,7 @@ def mirror(P):
 
 
 @kernel
-def reordered(P, order):
+def reordered(P: Array, order: IndexArray) -> Array:
     """P (n, n) with its rows and columns in an order (k,); those of a negative number are zero."""
     out = np.zeros((len(order), len(order)))
     for i in range(len(order)):
