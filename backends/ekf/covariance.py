@@ -17,14 +17,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg.blas import dsyr2k, dsyrk
 
-from backends.ekf import kernels
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
+from slam.runtime.compilation import kernel
 
 CAMERA = 12  #: fixed: size of the camera's state [r, φ, v, ω]
 POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 RECENT = 4  #: cost: poses before the present one that are kept
 HEAD = CAMERA + POSE * RECENT  #: fixed: size of camera and last poses, behind which the landmarks stand
+_BLOCK = 32  # cost: rows and columns that are mirrored at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +97,7 @@ class Covariance:
         """The camera's error (12,) becomes J times what it was, plus noise (12, 12).
 
         With `by_error`, the pose before, that (6, 6) times [r, φ], is now the first of the last ones; the last goes.
-        Some landmarks in the state (`rows` (M,)) have more noise then, `slide` (M, 3, 3).
+        Some landmarks (`rows` (M,) of the table) have more noise then, `slide` (M, 3, 3).
         """
         F = np.eye(HEAD) if by_error is None else np.eye(HEAD, k=-POSE)
         F[:CAMERA, :CAMERA] = J
@@ -108,10 +109,13 @@ class Covariance:
         own[:CAMERA, :CAMERA] += noise
         P[:HEAD, :HEAD] = 0.5 * (own + own.T)
         P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
+        known = self.known
         if rows is not None and slide is not None:
-            at = self.numbers(rows)
-            P[at[:, :, None], at[:, None, :]] += slide
-        return replace(self, P=P, by_rig=by_rig)
+            there, known = rows < self.correlated, known.copy()
+            at = self.numbers(rows[there])
+            P[at[:, :, None], at[:, None, :]] += slide[there]
+            known[rows[~there] - self.correlated] += slide[~there]
+        return Covariance(P, by_rig, known)
 
     # --- landmarks join and leave ---
 
@@ -134,7 +138,7 @@ class Covariance:
         joining = np.flatnonzero(rows >= self.correlated)
         numbers, at = np.append(np.arange(HEAD), self.numbers(rows)), self.numbers(joining)
         numbers[at] = -1
-        P, by_rig = kernels.rearranged(self.P, numbers), self.by_rig[numbers]
+        P, by_rig = reordered(self.P, numbers), self.by_rig[numbers]
         by_rig[at] = 0.0
         P[at[:, :, None], at[:, None, :]] = self.known[rows[joining] - self.correlated]
         return replace(self, P=P, by_rig=by_rig, known=self.known[known - self.correlated])
@@ -156,7 +160,7 @@ class Covariance:
         last, by_rig, M = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), CAMERA))
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
         P = dsyrk(1.0, U, 1.0, P.T, overwrite_c=1).T if U.size else P
-        kernels.mirror(P[:CAMERA, :CAMERA])
+        mirror(P[:CAMERA, :CAMERA])
         M[:CAMERA], M[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
         half = 0.5 * M @ P[:CAMERA, :CAMERA]  # T = 1 + [M, 0]:  T P Tᵀ = P + M Yᵀ + Y Mᵀ,  Y = P[:, :12] + M P_cc / 2
         P = dsyr2k(1.0, M, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
@@ -164,7 +168,7 @@ class Covariance:
         P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]
         summands = self.P.diagonal() + 2 * (half * M).sum(axis=1)
         summands[last] = 0.0
-        kernels.mirror(P)
+        mirror(P)
         return replace(self, P=positive(P, summands, V.shape[1]), by_rig=by_rig)
 
     def displaced(self, rows: IndexArray, change: Array, shift: Array) -> Covariance:
@@ -176,6 +180,28 @@ class Covariance:
         by_rig[self.numbers(rows).ravel(), -1:] -= change.reshape(-1, 1)
         nothing = np.zeros((len(self.P), 0))
         return replace(self, by_rig=by_rig).corrected(nothing, nothing, 0 * by_rig, np.eye(CAMERA), shift)
+
+
+@kernel
+def mirror(P: Array) -> None:
+    """The lower triangle of P (n, n) also above its diagonal, in place."""
+    n = len(P)
+    for first in range(0, n, _BLOCK):
+        for left in range(0, first + 1, _BLOCK):
+            for i in range(first, min(first + _BLOCK, n)):
+                for j in range(left, min(left + _BLOCK, i)):
+                    P[j, i] = P[i, j]
+
+
+@kernel
+def reordered(P: Array, order: IndexArray) -> Array:
+    """P (n, n) with its rows and columns in an order (k,); those of a negative number are zero."""
+    out = np.zeros((len(order), len(order)))
+    for i in range(len(order)):
+        for j in range(len(order) if order[i] >= 0 else 0):
+            if order[j] >= 0:
+                out[i, j] = P[order[i], order[j]]
+    return out
 
 
 def positive(P: Array, summands: Array, terms: int) -> Array:

@@ -101,27 +101,19 @@ class FilterLandmarks(LandmarkRows):
     c: Array  # coordinates (N, 3)
     points: Array  # positions (N, 3) [m] in the world, which follow from the two
     gauge: Array  # derivatives (N, 3, 6) of the coordinates by one of the world [shift, turn about its origin]
-    turned: Array  # largest angle (N,) between the lines of sight at first and since [rad]; π if known from elsewhere
+    sights: Array  # lines of sight (N, 3) up to which the slide is counted, in the world; NaN where that is not known
 
     @classmethod
-    def at(
-        cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array, turned: float = 0.0
-    ) -> FilterLandmarks:
-        """New ones at positions (M, 3)."""
+    def at(cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array) -> FilterLandmarks:
+        """New ones at positions (M, 3), seen from their anchors."""
         c = coordinates.of(anchors, points)
-        gauge = gauge_jacobian(coordinates, anchors, c, points)
-        return cls(ids, anchors, c, points, gauge, np.full(len(ids), turned))
+        gauge, sights = gauge_jacobian(coordinates, anchors, c, points), points - anchors[:, :, 3]
+        return cls(ids, anchors, c, points, gauge, sights / np.linalg.norm(sights, axis=1, keepdims=True))
 
     @classmethod
     def none(cls) -> FilterLandmarks:
         """No landmarks."""
         return cls.at(Euclidean(), np.zeros(0, np.int64), np.zeros((0, 3, 4)), np.zeros((0, 3)))
-
-    def angles(self, rows: IndexArray, at: Array) -> Array:
-        """Angles (M,) [rad] between the lines of sight of some rows at first, and from a position (3,)."""
-        first, now = self.points[rows] - self.anchors[rows, :, 3], self.points[rows] - at
-        cosine = (first * now).sum(axis=1) / np.sqrt((first**2).sum(axis=1) * (now**2).sum(axis=1))
-        return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
     def moved(self, coordinates: Coordinates, rows: IndexArray | slice, change: Array) -> FilterLandmarks:
         """With a change (M, 3) of the coordinates of some rows."""

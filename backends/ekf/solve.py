@@ -2,22 +2,35 @@
 
 In the papers' order: the innovation (`backends.ekf.innovation`), the gate, the gain ``K = P Hᵀ S⁻¹``, the corrected
 state ``x + K ν`` and its covariance ``P − K S Kᵀ`` (paper A, Eq. 11). What is kept is ``y = S⁻¹ ν``: the state changes
-by ``P Hᵀ y``.
+by ``P Hᵀ y``. From the outside in:
+
+- `agreement` tries the prior, then the caller's guess, then (`_restarted`) a pose on which the landmarks agree. If most
+  observations contradict the prediction, it is the prediction that is wrong: by more than its linearisation holds for,
+  or, after an impulse that the motion model does not expect, a gap, or a stretch with hardly anything to see, by more
+  than it can be. Then the camera restarts where the landmarks see it, in the same map.
+- `_agreed` refuses what so few wrong observations as pass the gate may agree on by chance.
+- `solve` updates by what the `gate` lets through, and takes in what the solution predicts after all.
+- `_agreeing` takes out what the other measurements contradict; `_iterate` linearises until that is good enough.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg.lapack import dpotrf
 
-from backends.ekf.covariance import HEAD, POSE
+from backends.ekf.camera import diagonal
+from backends.ekf.covariance import CAMERA, HEAD, POSE
 from backends.ekf.innovation import Linearisation, Solution, Update, diagonal_blocks
 from slam.data import BoolArray
+from slam.geometry import se3
 from slam.geometry.se3 import Array
-from slam.window.gating import squared_distances
+from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, by_chance, squared_distances
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
 #: further than needed does harm: it moves points to where noisy pixels want them, and claims information that is not
@@ -25,6 +38,9 @@ from slam.window.gating import squared_distances
 _LINEAR = 1.0
 #: Their errors together may move the pose by this share of its deviations: with a wide prior all have the same sign.
 _POSE_SHARE = 0.25
+
+#: The pose (4, 4) on which landmarks agree, if there is one.
+Search = Callable[[], "Array | None"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +51,60 @@ class Gated:
     limits: Array  # of the gate (M,)
     distances: Array  # squared, of the innovations (M,); NaN where none is predicted
     at: Linearisation  # where they are from
+
+
+def agreement(update: Update, guess: Array | None, search: Search) -> Solution | None:
+    """Solve with the prior, or where it fails the pose, that most observations agree with; None where there is none.
+
+    It is linearised at the prior, then at the guess, a pose (4, 4), if there is one. Where less than a third of the
+    observations agrees, and as many wrong ones might agree by chance, that agreement is ignored: it could move the pose
+    anywhere. An agreement of a minority counts only if nothing else is found; of two, the larger. `search` is only
+    called where nothing else helps. Raises LinAlgError where the reason is numerical.
+    """
+    if not (np.isfinite(update.camera.pose).all() and math.isfinite(update.covariance.P.trace())):
+        raise LinAlgError("the predicted state is not finite")
+    minorities, error, majority = [], None, (len(update.z) + 1) // 2
+    for T in (None,) if guess is None else (None, guess):
+        try:
+            agreed = _agreed(gate(update, T))
+        except LinAlgError as reason:  # another start may do
+            error = reason
+            continue
+        if agreed is not None and agreed.used.sum() >= majority:
+            return agreed
+        minorities += [] if agreed is None else [agreed]
+    found = _restarted(update, search, max(MIN_CONSENSUS, majority))
+    if found is None and not minorities and error is not None:
+        raise error
+    return found or max(minorities, key=lambda one: one.used.sum(), default=None)
+
+
+def _restarted(update: Update, search: Search, least: int) -> Solution | None:
+    """At the pose on which landmarks agree, if at least so many do."""
+    T = search() if len(update.z) >= least else None
+    if T is None:
+        return None
+    models, before = update.measure.models, update.camera.pose
+    far, turned = np.linalg.norm(T[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ T[:3, :3])
+    sigmas = far, turned, models.initial_velocity_sigma, models.initial_angular_velocity_sigma
+    there = update.facing(T)
+    noise = there.camera.of_body(diagonal(sigmas))
+    there = replace(there, covariance=there.covariance.camera_moved(np.eye(CAMERA), noise))
+    with suppress(LinAlgError):
+        found = solve(gate(there, T))
+        return found if found is not None and found.used.sum() >= least else None
+    return None
+
+
+def _agreed(gated: Gated) -> Solution | None:
+    """What agrees with a prediction, if it is more than might agree by chance at the gate's own level."""
+    found = solve(gated)
+    agreed = np.zeros_like(gated.used) if found is None else found.used
+    if len(agreed) < MIN_OBSERVATIONS or ONE_AGREES_IN * agreed.sum() >= len(agreed):
+        return found
+    update = gated.at.update
+    chance = by_chance(update.z, agreed, gated.distances, update.measure.models.gate_probability)
+    return None if chance else found
 
 
 def gate(update: Update, T: Array | None = None) -> Gated:

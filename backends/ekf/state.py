@@ -21,7 +21,7 @@ class FilterState:
 
     stamp: float  # time [s]; NaN before the first prediction
     frame: int  # number of the prediction, −1 before the first
-    closed: bool  # whether the pose may not be updated any more
+    measured: bool  # whether the pose may not be updated any more
     camera: Camera
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of everything
@@ -44,24 +44,29 @@ class FilterState:
         P = J @ self.covariance.pose @ J.T
         return np.asarray(0.5 * (P + P.T))
 
-    def advanced(self, stamp: float, motion: Motion, rows: IndexArray, density: float) -> FilterState:
+    def advanced(
+        self, stamp: float, motion: Motion, rows: IndexArray, density: float, unknown: float = 0.0, least: float = 0.0
+    ) -> FilterState:
         """At a later time, after a motion of the camera, which sees the landmarks of some rows (M,) then.
 
         A feature is found where the image looks like it; from another viewpoint that is another point of the surface. A
-        landmark's direction walks at random with the angle between its lines of sight, by `density` [rad / √rad].
+        landmark's direction walks at random with the angle between its lines of sight, by `density` [rad / √rad]; where
+        the earlier one is not known, as of a prior map, by as much as with an angle `unknown` [rad]. Angles of less
+        than `least` [rad] wait: a camera that stands seems to turn to and fro.
         """
         (camera, J, noise), landmarks, slide = motion, self.landmarks, None
         if density:
-            turned = landmarks.angles(rows, camera.pose[:3, 3])
-            farther = turned > landmarks.turned[rows]
-            rows, turned = rows[farther], turned[farther]
-            marks, angles = landmarks.select(rows), landmarks.turned.copy()
-            sight = marks.points - camera.pose[:3, 3]
-            across = (sight**2).sum(axis=1)[:, None, None] * np.eye(3) - sight[:, :, None] * sight[:, None, :]
-            D = marks.gauge[:, :, :3]
-            slide = (density**2 * (turned - marks.turned))[:, None, None] * (D @ across @ D.transpose(0, 2, 1))
-            angles[rows] = turned
-            landmarks = replace(landmarks, turned=angles)
+            sight, sights = landmarks.points[rows] - camera.pose[:3, 3], landmarks.sights.copy()
+            distance = np.linalg.norm(sight, axis=1, keepdims=True)
+            cosine = (sight / distance * sights[rows]).sum(axis=1)
+            angle = np.where(np.isnan(cosine), unknown, np.arccos(np.clip(cosine, -1.0, 1.0)))
+            some = angle > least
+            rows, sight, distance, angle = rows[some], sight[some], distance[some], angle[some]
+            across = (distance**2)[:, :, None] * np.eye(3) - sight[:, :, None] * sight[:, None, :]
+            D = landmarks.gauge[rows, :, :3]
+            slide = (density**2 * angle)[:, None, None] * (D @ across @ D.transpose(0, 2, 1))
+            sights[rows] = sight / distance
+            landmarks = replace(landmarks, sights=sights)
         covariance = self.covariance.camera_moved(J, noise, self.camera.by_error(), rows, slide)
         return FilterState(stamp, self.frame + 1, False, camera, landmarks, covariance)
 
@@ -85,7 +90,7 @@ class FilterState:
         covariance = self.covariance.appended(new.gauge @ self.camera.displacement(), noise, by_rig)
         end = self.covariance.correlated
         landmarks = self.landmarks.select(slice(end)).joined(new).joined(self.landmarks.select(slice(end, None)))
-        return replace(self, closed=True, landmarks=landmarks, covariance=covariance)
+        return replace(self, measured=True, landmarks=landmarks, covariance=covariance)
 
     def inserted(self, new: FilterLandmarks, covariances: Array) -> FilterState:
         """With landmarks known from elsewhere, by covariances (M, 3, 3) of their coordinates."""
