@@ -17,14 +17,7 @@ from urllib.parse import quote
 import numpy as np
 
 from slam import registry
-from slam.errors import (
-    ConfigurationError,
-    PartError,
-    SequenceError,
-    SlamError,
-    UnknownNameError,
-    cause,
-)
+from slam.errors import ConfigurationError, PartError, SequenceError, SlamError, UnknownNameError, cause
 from slam.files import expanded, note_input, reason
 from slam.geometry.rig import quarter_turn
 from slam.geometry.se3 import Array, pose

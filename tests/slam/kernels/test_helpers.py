@@ -6,21 +6,11 @@ import numpy as np
 import pytest
 
 from slam.geometry import se3 as reference
-from slam.geometry.rig import StereoRig
 from slam.kernels import linear, se3
 from tests.slam.numeric import positive
 
-RIG = StereoRig.rectified_pair(450.0, 320.0, 240.0, 0.12, 640, 480, doffs=3.0)
-CAMERA = RIG.rectified_parameters
 T = reference.exp(np.array([0.3, -0.5, 0.2, 1.0, 2.0, -3.0]))
-OTHER = reference.exp(np.array([-0.2, 0.1, 0.7, 0.5, -1.0, 2.0]))
-POINT = np.array([0.4, -0.3, 2.5])  # in front of the camera at T
 STEPS = [[0, 0, 0], [1e-9, 0, 0], [2e-5, -1e-5, 0], [9e-3, 0, 1e-3], [0.02, 0.01, 0], [1.0, -0.7, 0.4], [0, 3.1, 0]]
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(3)
 
 
 def call(helper, *arguments):
@@ -37,7 +27,8 @@ def filled(helper, *arguments, shape):
     return out
 
 
-def test_whitening(rng):
+def test_whitening():
+    rng = np.random.default_rng(3)
     C, g = positive(3, rng), rng.normal(size=3)
     W = filled(linear.whitener, C, shape=(3, 3))
     np.testing.assert_allclose(W, np.linalg.inv(np.linalg.cholesky(C)), rtol=1e-12, atol=1e-14)
