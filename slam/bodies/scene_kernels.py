@@ -266,6 +266,51 @@ def _window_tests(starts, tracks, L, eta, dWd, alone, scale, rest, asked, suppor
             clear[w] = value
 
 
+@helper
+def _seeds(own, rest, doubted, seeds):
+    """Which of a window's `own` tracks no group was sought from in vain, into `seeds` (N,).
+
+    How many, and how many of its tracks are of the rest.
+    """
+    size = inside = 0
+    seeds[:] = False
+    for m in own:
+        seeds[m] = not doubted[m]
+        size += seeds[m]
+        inside += rest[m]
+    return size, inside
+
+
+@helper
+def _company(sums, place, centre, width, scale, rest, seeds, support, work, motion, apart, fits, rows):
+    """Tracks of the rest near a window that move as its `seeds` (N,) do, into `rows` (N,); how many.
+
+    The search ends below `support`. `motion`, `apart` and `fits` are overwritten.
+    """
+    L, eta, dWd = sums
+    for m in range(len(dWd)):
+        rows[m] = rest[m] and not seeds[m]
+    _common_motion(L, eta, dWd, rows, work, motion)
+    _squares_against(L, eta, dWd, motion, scale, work[3], apart)
+    found = 0
+    for m in range(len(dWd)):  # a slice would make Numba compile messages about shapes, for two seconds
+        rows[m] = seeds[m]
+        found += seeds[m]
+    for _ in range(2):
+        if found < support:
+            break
+        _common_motion(L, eta, dWd, rows, work, motion)
+        _squares_against(L, eta, dWd, motion, scale, work[3], fits)
+        found = 0
+        for m in range(len(dWd)):
+            rows[m] = rest[m] and fits[m] < max(FITS, _EXPLAINED * apart[m])
+            rows[m] = rows[m] and apart[m] - fits[m] > (_BETTER if seeds[m] else CLEAR)
+            for axis in range(3):
+                rows[m] = rows[m] and abs(place[m, axis] - centre[axis]) < (0.5 + _AROUND) * width[axis]
+            found += rows[m]
+    return found
+
+
 @kernel
 def groups_apart(L, eta, dWd, place, starts, tracks, centres, widths, asked, support):
     """Groups of tracks that moved alike, and otherwise than the rest: the clearest first, until there is none.
@@ -275,7 +320,7 @@ def groups_apart(L, eta, dWd, place, starts, tracks, centres, widths, asked, sup
     moved. Returns the group of each track (N,), −1 for the rest; χ²(6) of each group (G,); χ²(3) of every track against
     the rest (N,); the rest's common motion (6,); and the ratio by which χ² was divided, 1 at least.
     """
-    n = len(dWd)
+    n, sums = len(dWd), (L, eta, dWd)
     work = np.empty(n), np.empty(21), np.empty(6), np.empty(21), np.empty((6, 6))
     group, values, common, motion = np.full(n, -1), np.empty(n), np.empty(6), np.empty(6)
     alone, apart, fits, clear = np.empty(n), np.empty(n), np.empty(n), np.empty(len(centres))
@@ -292,50 +337,26 @@ def groups_apart(L, eta, dWd, place, starts, tracks, centres, widths, asked, sup
         if 3 * left < n or len(clear) == 0:
             break
         _window_tests(starts, tracks, L, eta, dWd, alone, scale, rest, asked, support, LARGEST * left, clear)
-        found = 0
+        found, value = 0, 0.0
         for _ in range(_MOST):
             window = np.argmax(clear)
             if clear[window] <= 0:
                 break
-            inside, size = 0, 0
-            seeds[:] = False
-            for m in tracks[starts[window] : starts[window + 1]]:
-                seeds[m] = not doubted[m]
-                inside += rest[m]
-                size += seeds[m]
+            size, inside = _seeds(tracks[starts[window] : starts[window + 1]], rest, doubted, seeds)
             value, clear[window] = clear[window] + asked[inside], -np.inf
             if size < support:
                 continue
-            for m in range(n):
-                rows[m] = rest[m] and not seeds[m]
-            _common_motion(L, eta, dWd, rows, work, motion)
-            _squares_against(L, eta, dWd, motion, scale, work[3], apart)
-            for m in range(n):  # a slice would make Numba compile messages about shapes, for two seconds
-                rows[m] = seeds[m]
-            found = size
-            for _ in range(2):
-                if found < support:
-                    break
-                _common_motion(L, eta, dWd, rows, work, motion)
-                _squares_against(L, eta, dWd, motion, scale, work[3], fits)
-                found = 0
-                for m in range(n):
-                    rows[m] = rest[m] and fits[m] < max(FITS, _EXPLAINED * apart[m])
-                    rows[m] = rows[m] and apart[m] - fits[m] > (_BETTER if seeds[m] else CLEAR)
-                    for axis in range(3):
-                        off = abs(place[m, axis] - centres[window, axis])
-                        rows[m] = rows[m] and off < (0.5 + _AROUND) * widths[window, axis]
-                    found += rows[m]
+            at, wide = centres[window], widths[window]
+            found = _company(sums, place, at, wide, scale, rest, seeds, support, work, motion, apart, fits, rows)
             if found >= support:
-                for m in range(n):
-                    if rows[m]:
-                        group[m], rest[m] = groups, False
-                values[groups] = value
-                groups, left = groups + 1, left - found
                 break
-            found = 0
             for m in range(n):
                 doubted[m] = doubted[m] or seeds[m]
-        if found == 0:
+        if found < support:
             break
+        for m in range(n):
+            if rows[m]:
+                group[m], rest[m] = groups, False
+        values[groups] = value
+        groups, left = groups + 1, left - found
     return group, values[:groups].copy(), alone, common, scale
