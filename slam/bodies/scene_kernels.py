@@ -10,7 +10,7 @@ import numpy as np
 
 from slam.bodies.config import CLEAR
 from slam.chi_square import chi_square_limit
-from slam.kernels.linear import factorise, solve_factorised, square
+from slam.kernels.linear import factorise, median, solve_factorised, square
 from slam.kernels.se3 import point_by_motion
 from slam.runtime.compilation import disjoint_helper, helper, kernel
 
@@ -283,8 +283,15 @@ def _window_tests(windows, sums, columns, alone, scale, rest, asked, support, la
 def _next_group(windows, clear, sums, columns, place, scale, asked, support, rest, rows):
     """The group of the clearest window that has one: its tracks, marked in `rows` (N,), their number, and its χ²(6)."""
     n, (starts, tracks, centres, widths) = len(sums), windows
-    seeds, doubted, members, every = np.empty(n, np.bool_), ~rest, np.empty(n, np.intp), np.ones(n, np.bool_)
+    seeds, doubted, members, every = (
+        np.empty(n, np.bool_),
+        np.empty(n, np.bool_),
+        np.empty(n, np.intp),
+        np.ones(n, np.bool_),
+    )
     motion, apart, fits = np.empty(6), np.empty(n), np.empty(n)
+    for m in range(n):
+        doubted[m] = not rest[m]
     for _ in range(_MOST):
         window = np.argmax(clear)
         if clear[window] <= 0:
@@ -300,20 +307,21 @@ def _next_group(windows, clear, sums, columns, place, scale, asked, support, res
             continue
         for m in range(n):
             rows[m] = rest[m] and not seeds[m]
-        _common_motion(sums, columns, rows, motion)
-        _squares_against(columns, motion, apart)
-        for m in range(n):  # a slice would make Numba compile messages about shapes, for two seconds
-            rows[m] = seeds[m]
-        for _ in range(2):
-            if found < support:
-                break
-            count = 0
-            for m in range(n):
-                if rows[m]:
-                    members[count] = m
-                    count += 1
-            _common_motion(*_by_column(sums, members, count), every, motion)
-            _squares_against(columns, motion, fits)
+        for which in range(3):  # the others, the seeds, and those that go with these; a single call compiles once
+            count, own, own_columns, chosen = 0, sums, columns, rows
+            if which:
+                for m in range(n):
+                    if rows[m]:
+                        members[count] = m
+                        count += 1
+                own, own_columns = _by_column(sums, members, count)
+                chosen = every
+            _common_motion(own, own_columns, chosen, motion)
+            _squares_against(columns, motion, fits if which else apart)
+            if not which:
+                for m in range(n):  # a slice would make Numba compile messages about shapes, for two seconds
+                    rows[m] = seeds[m]
+                continue
             found = 0
             for m in range(n):
                 one, other = fits[m] / scale, apart[m] / scale
@@ -323,6 +331,8 @@ def _next_group(windows, clear, sums, columns, place, scale, asked, support, res
                     off = abs(place[m, axis] - centres[window, axis])
                     rows[m] = rows[m] and off < (0.5 + _AROUND) * widths[window, axis]
                 found += rows[m]
+            if found < support:
+                break
         if found >= support:
             return found, value
         for m in range(n):
@@ -345,12 +355,17 @@ def groups_apart(sums, place, codes, sizes, asked, support):
     windows = _full_windows(codes, sizes, support)
     clear = np.empty(len(windows[0]) - 1)
     group, values, common, alone = np.full(n, -1), np.empty(n), np.empty(6), np.empty(n)
-    rest, rows = np.ones(n, np.bool_), np.empty(n, np.bool_)
+    rest, rows, kept = np.ones(n, np.bool_), np.empty(n, np.bool_), np.empty(n)
     groups, left = 0, n
     while True:
         _common_motion(sums, columns, rest, common)
         _squares_against(columns, common, alone)
-        scale = max(1.0, np.median(alone[rest]) / MEDIAN)
+        count = 0
+        for m in range(n):
+            if rest[m]:
+                kept[count] = alone[m]
+                count += 1
+        scale = max(1.0, median(kept[:count]) / MEDIAN)
         for m in range(n):
             alone[m] /= scale
         if 3 * left < n or len(clear) == 0:

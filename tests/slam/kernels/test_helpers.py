@@ -37,6 +37,13 @@ def filled(helper, *arguments, shape):
     return out
 
 
+@pytest.mark.parametrize("values", [[2], [3, 1], [5, 1, 3], [1, 1, 2, 2, 1, 2], [4, 3, 2, 1, 0], "random"])
+def test_median(values, rng):
+    for n in range(1, 40) if values == "random" else [0]:
+        numbers = rng.normal(size=n).round(1) if n else np.array(values, float)
+        assert call(linear.median, numbers.copy()) == np.median(numbers)
+
+
 @pytest.mark.parametrize("n", [1, 3, 6, 20])
 def test_factorise_and_solve(n, rng):
     M, v = positive(n, rng), rng.normal(size=n)
