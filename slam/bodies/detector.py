@@ -24,7 +24,7 @@ from slam.bodies.estimator import FRAMES, BodyEstimator
 from slam.bodies.finder import Scene, parting
 from slam.bodies.fits import fit_positions, fit_velocities, record, revise_tracks
 from slam.bodies.following import follow, found_again, located, observed
-from slam.bodies.frame import NO_IDS, Frame, OnlinePose, Setup, recent_poses
+from slam.bodies.frame import NO_IDS, Frame, Setup
 from slam.bodies.membership import merge
 from slam.bodies.proof import Way, with_frame
 from slam.bodies.regions import Region, follow_regions
@@ -34,6 +34,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, transform
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
+from slam.third_party import OnlinePose, derived_recent
 from slam.tracks.table import Tracks
 
 _FORGOTTEN = 8.0  # [s] after which an unseen body is forgotten
@@ -166,7 +167,9 @@ class MovingObjectDetector(ObjectDetector):
         measured = among(len(local), tracks.row[tracks.row >= 0])
         measuring = local[measured & np.isfinite(local[:, 0])]
         self._path = [*self._path[-FRAMES:], OnlinePose(s.rig, s.sigma, estimate, measuring)]
-        cameras = recent_poses(recent, self._path)
+        cameras = recent
+        if cameras is None or len(cameras) < len(self._path):  # as of a back end that has corrected its past
+            cameras = derived_recent(self._path)
         return Frame(s, self._number, features, local, self._stamps.copy(), self._poses.copy(), cameras)
 
     def _advance_bodies(self, tracks: Tracks, frame: Frame) -> None:

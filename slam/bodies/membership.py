@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from slam.bodies.bodies import Body, in_body_axes, with_extent
+from slam.bodies.bodies import Body, hidden, in_body_axes, with_extent
 from slam.bodies.config import CLEAR, EXPLAINED, MIN_FRAMES, ROUNDS, RUN, WINDOW
 from slam.bodies.fits import fit_positions, times_vectors
 from slam.bodies.frame import Frame
@@ -98,7 +98,8 @@ def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> d
     """Add the tracks that fit a measured body to its members, and remove those that do not, in place.
 
     Inside a body that stereo resolves no proof of motion is needed. Returns by how much χ² each body explains its seen
-    members better than the still world (K,), and for how many others inside it the still world is clearly better.
+    members better than the still world (K,), and for how many others the still world is clearly better: inside it, and
+    behind one that is not proven, through which nothing should be seen.
     """
     said: dict[int, tuple[Array, int]] = {}
     bodies = {id: body for id, body in every.items() if body.measured}
@@ -111,6 +112,9 @@ def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> d
     for body in bodies.values():
         near = np.flatnonzero(_distances(body, tracks, free, MARGIN) < _NEAR)
         gain, against = _gain_of_joining(body, frame.resolves(body.T[:3, 3]), tracks, free[near])
+        if not body.proven:
+            behind = free[hidden([body], frame.eye, tracks.position[free])]
+            against += int((membership_test(body, tracks, behind)[0] < -CLEAR).sum())
         said[body.id] = kept[body.id], against
         better = gain > best[near]
         best[near[better]], whose[near[better]] = gain[better], body.id
