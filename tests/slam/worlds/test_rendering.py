@@ -78,11 +78,6 @@ def saddle(image: np.ndarray, start: np.ndarray) -> np.ndarray:
     return place
 
 
-def smoothed(image: np.ndarray) -> np.ndarray:
-    """An image whose edges are smooth enough for `saddle`."""
-    return cv2.GaussianBlur(image.astype(np.float32), (0, 0), 2.0)
-
-
 def corner_errors(sequence, frames) -> np.ndarray:
     """Rendered minus projected corners (N, 2) [px], left and right, of fields at least 22 px wide seen from before."""
     errors = []
@@ -93,7 +88,7 @@ def corner_errors(sequence, frames) -> np.ndarray:
         facing = -(world.landmarks.normals[seen.ids] * offset).sum(axis=1) / np.linalg.norm(offset, axis=1)
         clear = (seen.size > 22) & (facing > 0.5)
         for image, uv, camera in ((frame.left, seen.uv_left, rig.left), (frame.right, seen.uv_right, rig.right)):
-            smooth = smoothed(image)
+            smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 2.0)  # enough for `saddle`
             places = uv[clear & camera.in_image(uv, 12)]
             errors += [saddle(smooth, place) - place for place in places]
     return np.array(errors)
