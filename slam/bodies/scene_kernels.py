@@ -280,36 +280,6 @@ def _window_tests(starts, tracks, sums, columns, alone, scale, rest, asked, supp
 
 
 @helper
-<<<<<<< HEAD
-def _next_group(windows, clear, sums, columns, place, scale, asked, support, rest, rows):
-    """The group of the clearest window that has one: its tracks, marked in `rows` (N,), their number, and its χ²(6)."""
-    n, (starts, tracks, centres, widths) = len(sums), windows
-    seeds, doubted, members, every = np.empty(n, np.bool_), ~rest, np.empty(n, np.intp), np.ones(n, np.bool_)
-    motion, apart, fits = np.empty(6), np.empty(n), np.empty(n)
-    for _ in range(_MOST):
-        window = np.argmax(clear)
-        if clear[window] <= 0:
-            break
-        inside, found = 0, 0
-        seeds[:] = False
-        for m in tracks[starts[window] : starts[window + 1]]:
-            seeds[m] = not doubted[m]
-            inside += rest[m]
-            found += seeds[m]
-        value, clear[window] = clear[window] + asked[inside], -np.inf
-        if found < support:
-            continue
-        for m in range(n):
-            rows[m] = rest[m] and not seeds[m]
-        _common_motion(sums, columns, rows, motion)
-        _squares_against(columns, motion, apart)
-        for m in range(n):  # a slice would make Numba compile messages about shapes, for two seconds
-            rows[m] = seeds[m]
-        for _ in range(2):
-            if found < support:
-                break
-            count = 0
-=======
 def _seeds(own, rest, doubted, seeds):
     """Which of a window's `own` tracks no group was sought from in vain, into `seeds` (N,).
 
@@ -338,7 +308,6 @@ def _company(sums, columns, place, centre, width, scale, rest, seeds, support, r
     for which in range(3):  # of the others, the seeds, and those that go with these; compiled once for all
         count, own, own_columns, chosen = 0, sums, columns, rows
         if which:
->>>>>>> cost-ready
             for m in range(n):
                 if rows[m]:
                     members[count] = m
@@ -349,10 +318,6 @@ def _company(sums, columns, place, centre, width, scale, rest, seeds, support, r
         _squares_against(columns, motion, fits if which else apart)
         found = 0
         for m in range(n):
-<<<<<<< HEAD
-            doubted[m] = doubted[m] or seeds[m]
-    return 0, 0.0
-=======
             one, other = fits[m] / scale, apart[m] / scale
             goes = rest[m] and one < max(FITS, _EXPLAINED * other)
             goes = goes and other - one > (_BETTER if seeds[m] else CLEAR)
@@ -363,7 +328,6 @@ def _company(sums, columns, place, centre, width, scale, rest, seeds, support, r
         if found < support:
             break
     return found
->>>>>>> cost-ready
 
 
 @kernel
@@ -398,11 +362,6 @@ def groups_apart(sums, place, codes, sizes, asked, support):
             doubted[m] = not rest[m]
         if 3 * left < n or len(clear) == 0:
             break
-<<<<<<< HEAD
-        _window_tests(windows, sums, columns, alone, scale, rest, asked, support, LARGEST * left, clear)
-        found, value = _next_group(windows, clear, sums, columns, place, scale, asked, support, rest, rows)
-        if found == 0:
-=======
         _window_tests(starts, tracks, sums, columns, alone, scale, rest, asked, support, LARGEST * left, clear)
         found, value = 0, 0.0
         for _ in range(_MOST):
@@ -420,7 +379,6 @@ def groups_apart(sums, place, codes, sizes, asked, support):
             for m in range(n):
                 doubted[m] = doubted[m] or seeds[m]
         if found < support:
->>>>>>> cost-ready
             break
         for m in range(n):
             if rows[m]:
