@@ -17,6 +17,7 @@ from slam.data import Estimate, Observations, Patches, Prediction, RecentPoses, 
 from slam.errors import AnswerError, PartError, SlamError, cause
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
+from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, RecentBackend
 
 _LEAST = 1e-12 * np.eye(6)  # numerics: variances [rad²], [m²] of a pose that is known for certain
@@ -33,6 +34,7 @@ _ANSWERS: dict[str, tuple[type, dict[str, Any]]] = {
     "estimate": (Estimate, {**_POSE, "positions": ("n", 3), "covariances": ("n", 3, 3)}),
     "recent": (RecentPoses, {"stamps": ("k",), "poses": ("k", 4, 4), "covariance": ("6k", "6k")}),
     "positions": (np.ndarray, {"real": ("n", 3)}),
+    "trajectory": (Trajectory, {}),  # which checks itself
     "patches": (Patches, {"images": ("n", "s", "s"), "centres": ("n", 2), "size": ("n",)}),
     "align": (tuple, {}),
 }
@@ -67,7 +69,7 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
                 raise AnswerError(f"{where} must be an array of ids, got {value.dtype}")
             if name in _FINITE and not np.isfinite(value).all():
                 raise AnswerError(f"{where} is not finite")
-            if name in _POSES and not all(is_rigid(T, 1e-3) for T in value.reshape(-1, 4, 4)):
+            if name in _POSES and not is_rigid(value, 1e-3):
                 raise AnswerError(f"{where} is no rotation and translation")
             if name in _COVARIANCES and (value.diagonal(0, -2, -1) < -1e-9).any():  # 1e-9: rounding
                 raise AnswerError(f"{where} has a negative variance")

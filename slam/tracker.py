@@ -33,7 +33,7 @@ from slam.data import (
 )  # fmt: skip
 from slam.geometry.arrays import Array, changed, isin
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig
-from slam.geometry.se3 import inverse
+from slam.geometry.se3 import inverse, twice
 from slam.geometry.trajectory import Trajectory
 from slam.input.warnings import REPEATED
 from slam.interfaces import AligningFrontend, Backend, Frontend, MapBackend, RestingBackend
@@ -86,7 +86,7 @@ class State:
 
     def path(self) -> Trajectory:
         """The path by all back ends so far, in their frame."""
-        return Trajectory.joined([*self.past, self.backend.trajectory()])
+        return Trajectory.joined([*self.past, checked(self.backend, "trajectory", self.backend.trajectory())])
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,7 +308,7 @@ def frame_result(
 
 def _in_map(thing: MovingObject, T_map_odom: Array) -> MovingObject:
     """A body in the map's coordinates; of its covariances only the velocity's changes, the pose's is in body axes."""
-    e, R = thing.estimate, np.kron(np.eye(2), T_map_odom[:3, :3])
+    e, R = thing.estimate, twice(T_map_odom[:3, :3])
     motion, since = (T_map_odom @ T @ inverse(T_map_odom) for T in (thing.motion, thing.motion_since_found))
     pose, P = T_map_odom @ e.T_world_object, R @ e.velocity_covariance @ R.T
     estimate = replace(e, T_world_object=pose, velocity=R @ e.velocity, velocity_covariance=P)

@@ -35,15 +35,6 @@ def test_consensus_among_wrong_matches(share):
     assert np.abs(error[3:]).max() < 4 * 3.5 * 0.3 / 300 / np.sqrt(30) * 2
 
 
-def test_monocular_rows_count_by_their_left_pixel():
-    points, z = measured_from(T_TRUE)
-    z[::2, 2] = np.nan
-    z[0, 0] += 50
-    found = find_consensus(RIG, points, z, np.eye(4), threshold=1.0, hypotheses=100, seed=0)
-    assert not found.inliers[0]
-    assert found.inliers[1:].all()
-
-
 @pytest.mark.parametrize("right", [0, 2, 10])
 def test_left_pixels_alone_give_a_pose_far_from_the_guess(right):
     points, z = measured_from(T_TRUE, noise=0.3)
