@@ -198,10 +198,14 @@ class Solution:
 
     def weighted(self, X: Array) -> Array:
         """``S⁻¹ X`` of some columns (3M, ...) by what is used alone; zero in the rows of what is not."""
-        L_inverse = self.at.L_inverse
-        Y = L_inverse.T @ (L_inverse @ X) - self.E @ (self.E.T @ X)
-        Y[self.out] = 0.0
-        return np.asarray(Y)
+        L_inverse, X = self.at.L_inverse, self.of_used(X)
+        return self.of_used(L_inverse.T @ (L_inverse @ X) - self.E @ (self.E.T @ X))
+
+    def of_used(self, X: Array) -> Array:
+        """Columns (3M, ...) with zeros in the rows of what is not used: a wrong match may be off by anything."""
+        X = X.copy()
+        X[self.out] = 0.0
+        return X
 
     @cached_property
     def y(self) -> Array:
@@ -245,12 +249,13 @@ class Solution:
         """Squared distance (M,) of each landmark's measurement from what all others that are used predict.
 
         With ``y_j`` and ``Q_j`` in the rows j of a landmark that is used, its innovation is off by ``Q_j⁻¹ y_j``, with
-        covariance ``Q_j⁻¹``: the distance is ``y_jᵀ Q_j⁻¹ y_j``. Those that are not used are off by ``C⁻ᵀ Eᵀ ν``, with
-        covariance ``Q_bb⁻¹ = C⁻ᵀ C⁻¹``. A landmark that is not seen has distance 0.
+        covariance ``Q_j⁻¹``: the distance is ``y_jᵀ Q_j⁻¹ y_j``. Those that are not used are off by ``ν_b + C⁻ᵀ Eᵀ ν``,
+        with ν of the others, and covariance ``Q_bb⁻¹ = C⁻ᵀ C⁻¹``. A landmark that is not seen has distance 0.
         """
         E, root = self.E.reshape(len(self.used), 3, len(self.out)), self.root_inverse
         off, blocks = self.y.reshape(-1, 3).copy(), self.at.information - E @ E.transpose(0, 2, 1)
-        off[~self.used] = (self.at.nu @ self.E @ root).reshape(-1, 3)
+        nu = self.at.nu
+        off[~self.used] = (nu[self.out] + self.of_used(nu) @ self.E @ root).reshape(-1, 3)
         blocks[~self.used] = diagonal_blocks(root.T @ root)
         found = squared_distances(off, blocks)
         if not np.isfinite(found).all():

@@ -100,11 +100,8 @@ class FilterState:
 
     def removed(self, ids: IdArray) -> FilterState:
         """Without some landmarks (M,)."""
-        if not len(ids):
-            return self
-        stay = np.ones(len(self.landmarks), bool)
-        stay[self.landmarks.rows_of(ids)] = False
-        return self._rearranged(*(part[stay[part]] for part in self._parts()))
+        gone = self.landmarks.rows_of(ids)
+        return self._rearranged(*(np.setdiff1d(part, gone) for part in self._parts())) if len(ids) else self
 
     def with_all_of(self, ids: IdArray) -> FilterState:
         """With some landmarks (M,), which may be known from elsewhere, in the state."""

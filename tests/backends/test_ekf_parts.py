@@ -399,6 +399,10 @@ def test_one_factor_serves_any_choice_of_landmarks():
     off = at.nu[3:6] - cross @ np.linalg.solve(S, nu)
     conditional = at.S[3:6, 3:6] - cross @ np.linalg.solve(S, cross.T)
     assert solution.distances[1] == pytest.approx(off @ np.linalg.solve(conditional, off), rel=1e-6)
+    z = update.z + np.where(np.arange(12) == 4, 1e15, 0.0)[:, None]  # left out, however wrong it is
+    other = replace(update, z=z).linearised().solved(used)
+    np.testing.assert_allclose(other.change, solution.change, rtol=1e-9, atol=1e-12)
+    assert other.distances[[1, 2]] == pytest.approx(solution.distances[[1, 2]])
 
 
 @pytest.mark.parametrize("transports", [True, False])
