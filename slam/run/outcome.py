@@ -26,7 +26,7 @@ _LEAST_CHANGES = 10  # guard: changes of velocity of which a median is taken
 _ASIDE = 1.0  # guard: speed [m/s] at which no vehicle goes sideways
 
 #: guard: Changes of velocity [m/s] that no hand and no vehicle makes: as accelerations [m/s²], and over their median.
-#: With right paths of real and spoilt recordings accelerations are up to 10, ratios up to 12; with wrong ones 25 and 23.
+#: On real and spoilt recordings accelerations are up to 10, ratios up to 12 where the path is right, else 25 and 23.
 _AT_ONCE, _BRAKES, _RARE = 1.0, 20.0, 20.0
 
 #: guard: Median speeds [m/s] that no camera in a hand and no vehicle has, and median distances [m] that neither sees.
@@ -144,8 +144,8 @@ def scale_doubt(record: RunRecord, rig: StereoRig, driving: bool = False) -> str
 def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) -> str:
     """What to say where velocities change far more than the motion model lets them, or a vehicle goes sideways.
 
-    Images that are missing, or come twice, make single changes that no camera makes. Times in another unit or of another
-    rate do so in all frames, and a vehicle that is taken for a camera in a hand, unless the motion is known to be that
+    Images that are missing, or come twice, make single changes that no camera makes. Times in another unit or of other
+    rates do so in all frames, and a vehicle that is taken for a camera in a hand, unless the motion is known to be that
     of a vehicle. Empty where the motion is as expected.
     """
     velocities, both, durations = _velocities(record)
