@@ -10,6 +10,7 @@ from slam.geometry.se3 import Array, inverse, transform
 
 _LAG, _SIGMAS = 0.1, 5.0  # guard: lag of the right images [frames] that counts, and in standard deviations
 _LEAST, _MOST = 15, 64  # guard: blocks of frames of which a lag is taken; cost: that are kept apart
+_STILL = 0.1  # guard: flow [px], root mean square, of a camera that hardly moves: rows are the same in all its frames
 _FLOW = 4.0  # guard: flow [px] beyond which rows would differ by more than they are matched with
 
 
@@ -42,6 +43,8 @@ class MomentWatch:
             return
         step = inverse(before[0]) @ T_world_left
         sums = np.stack([self._products(self._before[1], step), self._products(before[1], inverse(step))])
+        if (sums[:, 1, 1] < _STILL**2 * sums[:, 2, 2]).any():
+            return
         if self._blocks and self._in_last < self._length:
             self._blocks[-1] = self._blocks[-1] + sums
             self._in_last += 1

@@ -25,6 +25,10 @@ _JERKY = 3.0
 _LEAST_CHANGES = 10  # guard: changes of velocity of which a median is taken
 _ASIDE = 1.0  # guard: speed [m/s] at which no vehicle goes sideways
 
+#: guard: Changes of velocity [m/s] that no hand and no vehicle makes: as accelerations [m/s²], and over their median.
+#: On real and spoilt recordings accelerations are up to 10, ratios up to 12 where the path is right, else 25 and 23.
+_AT_ONCE, _BRAKES, _RARE = 1.0, 20.0, 20.0
+
 #: guard: Median speeds [m/s] that no camera in a hand and no vehicle has, and median distances [m] that neither sees.
 _FASTEST = {False: 10.0, True: 100.0}
 _NEAREST = {False: 0.05, True: 1.0}
@@ -140,8 +144,9 @@ def scale_doubt(record: RunRecord, rig: StereoRig, driving: bool = False) -> str
 def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) -> str:
     """What to say where velocities change far more than the motion model lets them, or a vehicle goes sideways.
 
-    Times in another unit or of another rate do so, and a vehicle that is taken for a camera in a hand, unless the
-    motion is known to be that of a vehicle. Empty where the motion is as expected.
+    Images that are missing, or come twice, make single changes that no camera makes. Times in another unit or of other
+    rates do so in all frames, and a vehicle that is taken for a camera in a hand, unless the motion is known to be that
+    of a vehicle. Empty where the motion is as expected.
     """
     velocities, both, durations = _velocities(record)
     if len(velocities) < _LEAST_CHANGES + 1:
@@ -161,6 +166,15 @@ def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) 
                 "median, which no vehicle does: unless the camera looks to the side, something large that moved past "
                 "was taken for the world"
             )
+    faster = np.linalg.norm(np.diff(velocities[:, 3:], axis=0), axis=1)[both[1:] & both[:-1]]
+    needs = faster / between[both[1:] & both[:-1], 0]
+    torn = faster[(faster > _AT_ONCE) & (needs > max(_BRAKES, _RARE * float(np.median(needs))))]
+    if len(torn):
+        return (
+            f"the velocity changes by {_rounded(float(torn.max()))} m/s from one frame to the next, as no camera's "
+            "does: images are missing, come twice or are exchanged there, or something large that moved was taken for "
+            "the world"
+        )
     ratio = float(np.median(np.sqrt((counted**2).reshape(-1, 2, 3).mean(2)).max(1)))
     if not ratio >= _JERKY:  # also where it is no number
         return ""
@@ -181,10 +195,14 @@ def median_depth(features: StereoFeatures, rig: StereoRig) -> float:
 
 
 def _velocities(record: RunRecord) -> tuple[Array, BoolArray, Array]:
-    """Velocities (N, 6) between frames in the camera's axes [rad/s, m/s], whether both were measured, times [s]."""
+    """Velocities (N, 6) between frames in the camera's axes [rad/s, m/s], whether both were measured, times [s].
+
+    Where a loop moves the path, what is between is no motion.
+    """
     measured, durations = np.array(record.measured, bool), np.diff(record.stamps)
-    poses = np.array(record.poses).reshape(-1, 4, 4)
-    return log(inverse(poses[:-1]) @ poses[1:]) / durations[:, None], measured[1:] & measured[:-1], durations
+    poses, moved = np.array(record.poses).reshape(-1, 4, 4), np.isin(np.arange(1, len(record.poses)), record.closed)
+    both = measured[1:] & measured[:-1] & ~moved
+    return log(inverse(poses[:-1]) @ poses[1:]) / durations[:, None], both, durations
 
 
 def _depth(record: RunRecord) -> float:

@@ -107,6 +107,16 @@ def test_a_vehicle_that_goes_sideways_is_doubted():
     assert motion_doubt(along((0.3, 0, 0.05)), MotionModel()) == ""
 
 
+@pytest.mark.parametrize("closed", [[], [15]])
+def test_a_camera_that_jumps_is_doubted_but_not_where_a_loop_moves_the_path(closed):
+    run = along((0, 0, 0.4), closed=closed)
+    assert motion_doubt(run, MotionModel()) == ""
+    for k in range(15, 30):  # as by images that are missing
+        run.poses[k] = exp(np.array([0, 0, 0, 0, 0, 2.0])) @ run.poses[k]
+    said = motion_doubt(run, MotionModel())
+    assert said.startswith("the velocity changes by 20 m/s from one frame to the next") if not closed else said == ""
+
+
 @pytest.mark.parametrize(("doubt", "status"), [("", 0), ("rows do not agree", 1)])
 def test_a_path_that_cannot_be_trusted_does_not_look_like_one_that_can(doubt, status, tmp_path, capsys):
     summary = {"frames": 9, "status": {"tracked": 8}, "tracking": "", "doubt": doubt, "path_length_m": 1.0}
