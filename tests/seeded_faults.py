@@ -50,7 +50,7 @@ NEAREST = {
     "backends/window": "tests/backends/test_window.py tests/backends/test_insert.py",
     "backends/batch": "tests/backends/test_all_backends.py tests/backends/test_batch.py",
     "frontends": "tests/frontends",
-    "slam/window": "tests/slam/window tests/backends/test_window.py",
+    "slam/window": "tests/slam/window tests/backends/test_window.py tests/backends/test_all_backends.py",
     "slam/kernels": "tests/slam/kernels tests/backends/test_all_backends.py tests/backends/test_batch.py",
     **{f"slam/{room}": f"tests/slam/{room}" for room in ("input", "tracks", "bodies", "atlas", "calibration")},
 }

@@ -176,8 +176,11 @@ class SelfCalibration:
         if not self.config.enabled:
             return
         self._seen += 1
+        # 0.05: one frame at least per rotation by this angle [rad]: turns are rare, and alone show the focal length
+        least, before = 1 + 2 * np.cos(0.05), self._looked
+        turned = before is None or np.sum(T_world_left[:3, :3] * before[:3, :3]) < least
         # 20: after this many pairs every second frame is used, after twice as many every third, and so on
-        if self._seen % (1 + self.pairs // 20) and not self._has_turned(T_world_left):
+        if self._seen % (1 + self.pairs // 20) and not turned:
             return
         self._looked = T_world_left
         view = View.of(self.model, features, T_world_left, _MOST_FEATURES)
@@ -193,12 +196,6 @@ class SelfCalibration:
         # By rows alone the posterior would change little: it follows what motion shows.
         if self.pairs > pairs or (self._open is not part and (self.pairs or self._open is not None)):
             self._update()
-
-    def _has_turned(self, T_world_left: Array) -> bool:
-        """Whether the camera has rotated since the last frame that was used, by the cosine of the angle."""
-        # 0.05: one frame at least per rotation by this angle [rad]: turns are rare, and alone show the focal length
-        least = 1 + 2 * np.cos(0.05)
-        return self._looked is None or bool(np.sum(T_world_left[:3, :3] * self._looked[:3, :3]) < least)
 
     def _compare(self, view: View) -> None:
         """Compare a view with the earlier ones, oldest first, until one still overlaps too much and keeps waiting."""
