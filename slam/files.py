@@ -56,31 +56,33 @@ def note_input(path: str | Path) -> None:
         noted.append(Path(path).absolute())
 
 
+def _status(path: str | Path, error: type[SlamError], expected: str = "") -> os.stat_result:
+    """That of a regular file that is read now; raises `error` where there is none."""
+    try:
+        status = Path(path).stat()
+    except OSError as fault:
+        raise error(f"{path}: {reason(fault)}") from fault
+    except (ValueError, TypeError) as fault:  # a NUL or a lone surrogate in the name; no name at all
+        raise error(f"{path}: no possible file name") from fault
+    if not stat.S_ISREG(status.st_mode):  # a pipe or a device would block
+        raise error(f"{path}: not a regular file{expected and f'; expected is {expected}'}")
+    note_input(path)
+    return status
+
+
 def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceError, expected: str = "") -> bytes:
     """The content of a regular file; raises `error` where it is missing, unreadable or larger than `limit`.
 
     `expected` says which file is meant, where it is none.
     """
+    size = _status(path, error, expected).st_size
+    if size > limit:
+        raise error(f"{path}: the file is larger than {limit / _MEBI:.3g} MiB")
     try:
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+        with Path(path).open("rb") as file:
+            return file.read(size)  # no more: files in /proc state none, may be endless, and may block
     except OSError as fault:
         raise error(f"{path}: {reason(fault)}") from fault
-    except (ValueError, TypeError) as fault:  # a NUL or a lone surrogate in the name; no name at all
-        raise error(f"{path}: no possible file name") from fault
-    note_input(path)
-    try:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise error(f"{path}: not a regular file{expected and f'; expected is {expected}'}")
-        if status.st_size > limit:
-            raise error(f"{path}: the file is larger than {limit / _MEBI:.3g} MiB")
-        # No more than the stated size: files in /proc state none, may be endless, and may block.
-        with os.fdopen(descriptor, "rb", closefd=False) as file:
-            return file.read(status.st_size) or b""
-    except OSError as fault:
-        raise error(f"{path}: {reason(fault)}") from fault
-    finally:
-        os.close(descriptor)
 
 
 def read_text(path: str | Path, limit: int = TEXT_LIMIT, error: type[SlamError] = SequenceError) -> str:
@@ -174,18 +176,9 @@ def _text(fault: BaseException) -> str:
 
 def require_content(path: Path) -> None:
     """Raise SequenceError where a path, for a library that opens it by itself, is no regular file with content."""
-    try:
-        status = path.stat()
-    except OSError as fault:
-        raise SequenceError(f"{path}: {reason(fault)}") from fault
-    except ValueError as fault:
-        raise SequenceError(f"{path}: no possible file name") from fault
-    if not stat.S_ISREG(status.st_mode):
-        raise SequenceError(f"{path}: not a regular file")
-    if not status.st_size:
+    if not _status(path, SequenceError).st_size:
         raise SequenceError(f"{path}: the file is empty")
     require_utf8(path, SequenceError)
-    note_input(path)
 
 
 def require_utf8(path: Path, error: type[SlamError] = SlamError) -> None:
