@@ -84,12 +84,6 @@ def remove_members(tracks: Tracks, rows: IndexArray, body: Body) -> None:
     tracks.unfound[rows] = 1
 
 
-def _release(tracks: Tracks, rows: IndexArray) -> None:
-    """Make seen members free tracks that keep their measurements, in place."""
-    tracks.body[rows], tracks.misfit[rows], tracks.streak[rows], tracks.expelled[rows] = -1, 0, 0, True
-    fit_positions(tracks, rows)
-
-
 def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> dict[int, tuple[Array, int]]:
     """Add the tracks that fit a measured body to its members, and remove those that do not, in place.
 
@@ -151,7 +145,9 @@ def _expel(body: Body, tracks: Tracks) -> Array:
     tracks.sure[mine] |= fits & (gain > CLEAR)
     remove_members(tracks, mine[wrong & ~seen], body)
     tracks.expelled[mine[wrong]] = True
-    _release(tracks, mine[wrong & seen])
+    left = mine[wrong & seen]  # these keep their measurements
+    tracks.body[left], tracks.misfit[left], tracks.streak[left] = -1, 0, 0
+    fit_positions(tracks, left)
     stay = seen & ~wrong
     return gain[stay] - 6.0 * float(body.known.sum()) / max(int(stay.sum()), 1)
 
