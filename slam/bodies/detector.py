@@ -84,7 +84,7 @@ class MovingObjectDetector(ObjectDetector):
     """Finds moving bodies without being told; `models` say how noisy pixels are, and how bodies move."""
 
     def __init__(self, rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> None:
-        self.setup = Setup(rig, config, models)
+        self.setup = Setup(rig, config, models.objects, models.pixel_sigma)
         self.window = WINDOW
         self._estimator = BodyEstimator(rig, models)
         self._next_track = 0

@@ -29,7 +29,6 @@ from slam.window.solver import Solution, linearised, solve
 from slam.window.stereo import RectifiedStereo
 
 FRAMES = 4  #: cost: frames of a window; older ones are marginalised
-_SOLVED_AGAIN = 4  # numerics: how often it is solved again without observations that disagree with the others
 _LEAST = 2  # points that must agree with a body that has more: one agrees with some pose always
 
 
@@ -176,7 +175,7 @@ class BodyEstimator:
         motion = carried(b, cameras, self.models)
         limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.gate)
         enough = min(_LEAST, (int(b.alive.sum()) + 1) // 2)
-        for again in range(_SOLVED_AGAIN + 1):
+        while True:  # without those that disagree with the others
             if used.sum() < enough:
                 return None, ids[:0], ids
             tried = changed(b, rows=b.rows.joined(Rows.of(len(b) - 1, rows[used], z[used], self.sigma)))
@@ -185,7 +184,7 @@ class BodyEstimator:
             distances = solution.left_out_distances(-1, rows[used], z[used], local[rows[used]], self.sigma)
             excess = distances / limits[used]
             bad = excess > max(1.0, 0.5 * float(excess.max()))  # the worst draw the pose, and others seem bad
-            if not bad.any() or again == _SOLVED_AGAIN:
+            if not bad.any():
                 break
             used[np.flatnonzero(used)[bad]] = False
         return self._after(tried, solution, local, rows, used), ids[used], ids[~used]

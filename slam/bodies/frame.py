@@ -12,7 +12,7 @@ from slam.bodies.config import ObjectsConfig
 from slam.data import IdArray, IndexArray, RecentPoses, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.models import EstimatorModels, ObjectModels
+from slam.models import ObjectModels
 
 _SHARE = 0.05  # of the depth, as the radius of what may be a body where bodies have no least size
 
@@ -23,17 +23,8 @@ class Setup:
 
     rig: StereoRig
     config: ObjectsConfig
-    estimators: EstimatorModels
-
-    @cached_property
-    def sigma(self) -> float:
-        """Pixel noise [px]."""
-        return self.estimators.pixel_sigma
-
-    @cached_property
-    def models(self) -> ObjectModels:
-        """How bodies are assumed to move."""
-        return self.estimators.objects
+    models: ObjectModels  # how bodies are assumed to move
+    sigma: float  # pixel noise [px]
 
     @cached_property
     def slide(self) -> float:

@@ -71,8 +71,6 @@ def _with_poses_fitted(body: Body, tracks: Tracks, rows: IndexArray) -> Body:
 
 def add_members(body: Body, tracks: Tracks, rows: IndexArray, sure: bool = False) -> None:
     """Make tracks members of a body, in place; their points in it are what they measured over the window."""
-    if not len(rows):
-        return
     points, A, _ = in_body_axes(body, tracks, rows)
     tracks.body[rows], tracks.misfit[rows], tracks.streak[rows], tracks.doubtful[rows] = body.id, 0, 0, False
     tracks.local[rows], tracks.local_information[rows] = weighted_means(points, A), A.sum(axis=1)
@@ -81,17 +79,9 @@ def add_members(body: Body, tracks: Tracks, rows: IndexArray, sure: bool = False
 
 def remove_members(tracks: Tracks, rows: IndexArray, body: Body) -> None:
     """Make members free tracks without measurements, in place."""
-    if not len(rows):
-        return
     tracks.position[rows] = transform(body.T, tracks.local[rows])
     tracks.forget_past(rows)
     tracks.unfound[rows] = 1
-
-
-def _release(tracks: Tracks, rows: IndexArray) -> None:
-    """Make seen members free tracks that keep their measurements, in place."""
-    tracks.body[rows], tracks.misfit[rows], tracks.streak[rows], tracks.expelled[rows] = -1, 0, 0, True
-    fit_positions(tracks, rows)
 
 
 def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> dict[int, tuple[Array, int]]:
@@ -153,10 +143,11 @@ def _expel(body: Body, tracks: Tracks) -> Array:
     stays = tracks.still[mine] & (body.moving | ~tracks.sure[mine])
     wrong = stays | (tracks.misfit[mine] >= RUN) | (seen & ((gain < -CLEAR) | unfit))
     tracks.sure[mine] |= fits & (gain > CLEAR)
-    if wrong.any():
-        remove_members(tracks, mine[wrong & ~seen], body)
-        tracks.expelled[mine[wrong]] = True
-        _release(tracks, mine[wrong & seen])
+    remove_members(tracks, mine[wrong & ~seen], body)
+    tracks.expelled[mine[wrong]] = True
+    left = mine[wrong & seen]  # these keep their measurements
+    tracks.body[left], tracks.misfit[left], tracks.streak[left] = -1, 0, 0
+    fit_positions(tracks, left)
     stay = seen & ~wrong
     return gain[stay] - 6.0 * float(body.known.sum()) / max(int(stay.sum()), 1)
 

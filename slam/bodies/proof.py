@@ -10,11 +10,8 @@ frames agree, less that of the rest of the scene, is known to within
 
 Members also share errors of which nothing is known: a junction of two edges at different depths slides along both as
 the camera moves. Therefore the body's places in the frames of the window, or those of its ends, must lie along a way
-better than they scatter about it (an F test): a junction jumps, and it does not turn as a whole. What the way has in
-common with that of the camera says nothing: with a wrong disparity the place goes a share of the camera's way.
-
-Along a repeated pattern right matches can be wrong for all members alike, by a disparity that changes with the view.
-Their way does not tell, but such features find no right match in half of their frames.
+better than they scatter about it (an F test): a junction jumps. What the way has in common with the camera's says
+nothing, nor do members that find a right match in half of their frames only, as along a repeated pattern.
 """
 
 from __future__ import annotations

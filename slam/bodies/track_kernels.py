@@ -177,16 +177,6 @@ def _mean(points, A, mean):
         mean[i] = row_times(P, i, told)
 
 
-@helper
-def _square(points, A, mean):
-    """χ² of "one fixed point" for a window's points (W, 3) with information (W, 3, 3); `mean` is overwritten."""
-    _mean(points, A, mean)
-    total = 0.0
-    for w in range(len(points)):
-        total += square(A[w], (points[w, 0] - mean[0], points[w, 1] - mean[1], points[w, 2] - mean[2]))
-    return total
-
-
 @kernel
 def windows_in_body(A, p, dof, anchor, rows, history, known):
     """What tracks measured, in the coordinates of a body with poses `history` (W, 4, 4) at the slots `known` (W,).
@@ -223,9 +213,12 @@ def weighted_means(points, A):
 @kernel
 def squares(points, A):
     """χ² (M,) of "one fixed point" for points by slot (M, W, 3) with information (M, W, 3, 3)."""
-    out, mean = np.empty(len(points)), np.empty(3)
+    out, mean = np.zeros(len(points)), np.empty(3)
     for m in range(len(points)):
-        out[m] = _square(points[m], A[m], mean)
+        p = points[m]
+        _mean(p, A[m], mean)
+        for w in range(len(p)):
+            out[m] += square(A[m, w], (p[w, 0] - mean[0], p[w, 1] - mean[1], p[w, 2] - mean[2]))
     return out
 
 

@@ -10,7 +10,6 @@ from slam.bodies.config import WINDOW, ObjectsConfig
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
 from slam.evaluation.objects import score_for
-from slam.geometry.se3 import inverse, transform
 
 
 def system_for(sequence, mode="detect", **settings):
@@ -91,30 +90,6 @@ def test_nothing_moves_in_a_still_world():
         flagged, count = flagged + len(result.moving_features), count + len(result.features)
         assert not result.objects
     assert flagged <= 0.002 * count
-
-
-def test_members_are_predicted_where_they_are_seen():
-    """The estimate's frame of a body is its own; the detector's points are in the detector's."""
-    sequence = slam.open_sequence("synthetic:box?density=300")
-    system = system_for(sequence)
-    off = []
-    for k in range(58, 110):
-        result = system.process_features(sequence.observations(k))
-        tracks, features = system._state.tracks, result.features
-        for body in system.objects.bodies.values():
-            if body.measured:
-                mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
-                local = transform(inverse(result.estimate.T_world_left) @ body.T, tracks.local[mine])
-                z, _ = sequence.rig.project_stereo(local)
-                off += list(np.linalg.norm(z[:, :2] - features.uv_left[tracks.row[mine]], axis=1))
-    assert len(off) > 100
-    assert np.median(off) < 2.0  # noise of 0.7 px in both coordinates: 0.8 px
-
-
-def test_off_detects_nothing():
-    sequence = slam.open_sequence("synthetic:box?density=300")
-    system = system_for(sequence, mode="off")
-    assert not any(len(system.process_features(sequence.observations(k)).moving_features) for k in range(58, 90))
 
 
 @pytest.mark.parametrize("wrong", [{"mode": "neural"}, {"mode": "procedure1"}, {"max_speed": 0.0}, {"suspect": 0.0}])

@@ -68,7 +68,7 @@ def begin(tracks, features, rows, points):
 
 def frame_of(features, max_speed=40.0):
     """The frame of some features, with the camera at the world's origin."""
-    setup = Setup(RIG, ObjectsConfig(max_speed=max_speed), MODELS)
+    setup = Setup(RIG, ObjectsConfig(max_speed=max_speed), MODELS.objects, MODELS.pixel_sigma)
     stamps = np.concatenate([[-0.1, 0.0], np.full(WINDOW - 2, np.nan)])
     local = RIG.triangulate(features.uv_left, features.uv_right)
     return Frame(setup, 1, features, local, stamps, np.tile(np.eye(4), (WINDOW, 1, 1)), CAMERAS)

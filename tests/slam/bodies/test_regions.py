@@ -20,7 +20,12 @@ from slam.models import models_for
 DT, WINDOW = 0.1, 12
 VELOCITY, START = np.array([0.5, 0.0, 5.0]), np.array([5.0, 0, 20])
 RIG = StereoRig.rectified_pair(700.0, 620, 188, 0.54, 1241, 376)
-SETUP = Setup(RIG, ObjectsConfig(size=2.0, min_speed=1.0, max_speed=25.0), models_for("driving"))
+SETUP = Setup(
+    RIG,
+    ObjectsConfig(size=2.0, min_speed=1.0, max_speed=25.0),
+    models_for("driving").objects,
+    models_for("driving").pixel_sigma,
+)
 
 
 def frame(dt: float = DT) -> Frame:
