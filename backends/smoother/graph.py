@@ -31,7 +31,10 @@ def solving() -> Iterator[None]:
     try:
         yield
     except (RuntimeError, ValueError, LookupError) as error:
-        raise SolverError(f"gtsam: {' '.join(str(error).split())[:200] or type(error).__name__}") from error
+        why = " ".join(str(error).split())[:200] or type(error).__name__
+        if "unknown exception" in why:  # so gtsam says, of a strict factor (`FactorMaker.smart`)
+            why = "a near landmark lies behind a camera that measured it"
+        raise SolverError(f"gtsam: {why}") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,9 +169,10 @@ class Graph:
         """
         if not self._is_of(s):
             return last, s.spread[s.of(last)]
-        solved, begin = self.number, s.oldest(self._lag, self.number)
-        begin, first = max(begin, min(first, solved - 1)), max(begin, first)
-        P = self._joint(list(range(begin, solved + 1)))
+        oldest, solved = s.oldest(self._lag, self.number), self.number
+        first = max(oldest, first)
+        begin = max(oldest, min(first, solved - 1))  # where the motion goes on, it needs two poses
+        P = self._joint(list(range(begin, min(solved, last) + 1)))
         for number in range(solved + 1, last + 1):
             _, J, noise, _ = s.moved(self._make.models, number)
             J, columns, aside = J[:, -len(P) :], slice(len(P) - min(len(P), 12), len(P)), s.aside.get(number)

@@ -31,6 +31,7 @@ class Track:
     points: list[gtsam.StereoPoint2] = field(default_factory=list)
     # whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only
     stereo: bool = False
+    far: bool = False  # whether noise alone may put it behind the camera, by one of them
     slot: int = -1  # of the factor in the solver, −1 while there is none
 
     def takes_any(self, first: int) -> bool:
@@ -114,6 +115,7 @@ class Tracks:
             track.keys.append(key)
             track.points.append(point)
             track.stereo = track.stereo or z[2] == z[2]  # not NaN
+            track.far = track.far or z[0] - z[2] < make.far
             problem.grown[serial, track.poses[0]] = track
             if factor == VARIABLE and track.stereo:
                 self._turn(problem, s, serial, number)
@@ -177,7 +179,7 @@ class Tracks:
             place = transform(problem.to_graph @ s.poses[s.of(known.pose)], known.position[None])[0]
         problem.values.insert(landmark_key(serial), place)
 
-    def make_smart(self, problem: GraphProblem, careful: bool) -> list[tuple[Track, int]]:
+    def make_smart(self, problem: GraphProblem, silent: bool) -> list[tuple[Track, int]]:
         """The smart factors of what grew, and their places in the problem; see `FactorMaker.smart`."""
         made = []
         for track in problem.grown.values():
@@ -185,7 +187,7 @@ class Tracks:
                 if track.slot >= 0:
                     problem.removed.append(track.slot)
                 made.append((track, problem.factors.size()))
-                problem.factors.add(self._make.smart(track.points, track.keys, careful))
+                problem.factors.add(self._make.smart(track.points, track.keys, silent or track.far))
         return made
 
     def forget(self, s: SmootherState, oldest: int) -> None:
