@@ -15,13 +15,13 @@ import numpy as np
 
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import landmark_key, pose_key
-from backends.smoother.graph import minimised, solving
+from backends.smoother.graph import by_pose, held, minimised, solving
 from backends.smoother.state import SmootherState
 from backends.smoother.tracks import GraphProblem, Tracks
 from slam.data import Estimate
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, transform
+from slam.geometry.se3 import Array, adjoint, inverse, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
@@ -78,8 +78,10 @@ class BatchBackend:
         covariances[others] = self._smoother.landmark_covariances(rows[others])
         for row in np.flatnonzero(~others).tolist():
             key = landmark_key(serials[row])
-            positions[row], covariances[row] = solution.values.atPoint3(key), solution.covariance(key)
-        T, P = solution.poses[-1].copy(), solution.covariance(solution.newest)
+            positions[row] = solution.values.atPoint3(key)
+            covariances[row] = solution.covariance(key, by_pose(solution.poses[0], positions[row]))
+        T = solution.poses[-1].copy()
+        P = solution.covariance(solution.newest, adjoint(inverse(T) @ solution.poses[0]))
         return Estimate(rough.stamp, T, P, marks.ids[rows], positions, covariances)
 
     @one_blas_thread
@@ -107,7 +109,8 @@ class _BatchSolution:
         self.state = s  # what it is the solution for
         numbers = range(s.begun, s.number + 1)
         problem, tracks = GraphProblem(), Tracks(make, None)
-        problem.factors.add(make.prior(s.begun, s.start, s.prior))
+        prior, self._base = held(s, s.begun)
+        problem.factors.add(make.prior(s.begun, s.start, prior))
         for number in numbers:
             tracks.add_pose(problem, s, number, s.begun)
         places = _places(s, make.stereo, numbers)
@@ -133,10 +136,10 @@ class _BatchSolution:
     def _marginals(self) -> gtsam.Marginals:
         return gtsam.Marginals(self._factors, self.values)
 
-    def covariance(self, key: int) -> Array:
-        """Marginal covariance of a variable; SolverError where gtsam fails."""
+    def covariance(self, key: int, by_first: Array) -> Array:
+        """Marginal covariance (n, n) of a variable, which the first pose moves by `by_first` (n, 6); SolverError."""
         with solving():
-            return np.asarray(self._marginals.marginalCovariance(key))
+            return np.asarray(self._marginals.marginalCovariance(key) + by_first @ self._base @ by_first.T)
 
 
 def _places(s: SmootherState, stereo: RectifiedStereo, numbers: range) -> dict[int, Array]:

@@ -190,8 +190,7 @@ class Graph:
         key = landmark_key(serial)
         if not self._is_of(s) or not self._solver.getLinearizationPoint().exists(key):
             return None
-        R = self._first[:3, :3]
-        J = R @ points_by_pose(transform(inverse(self._first), position[None]))[0]
+        J = by_pose(self._first, position)
         R = self._to_state[:3, :3]
         return np.asarray(R @ self._solver.getISAM2().marginalCovariance(key) @ R.T + J @ self._base @ J.T)
 
@@ -228,6 +227,11 @@ def held(s: SmootherState, number: int) -> tuple[Array, Array]:
     prior = np.diag(np.minimum(np.diag(P), _FIRM))
     values, vectors = np.linalg.eigh(P - prior)
     return prior, (vectors * values.clip(min=0)) @ vectors.T
+
+
+def by_pose(T: Array, position: Array) -> Array:
+    """Derivatives (3, 6) of a point (3,) in the world that is fixed to a pose T (4, 4)."""
+    return np.asarray(T[:3, :3] @ points_by_pose(transform(inverse(T), position[None]))[0])
 
 
 def minimised(problem: GraphProblem, iterations: int) -> gtsam.Values:
