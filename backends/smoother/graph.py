@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -175,13 +176,12 @@ class Graph:
         P = self._joint(list(range(begin, min(solved, last) + 1)))
         for number in range(solved + 1, last + 1):
             _, J, noise, _ = s.moved(self._make.models, number)
-            J, columns, aside = J[:, -len(P) :], slice(len(P) - min(len(P), 12), len(P)), s.aside.get(number)
-            if aside is not None and aside.anchor >= begin:
-                J, noise = adjoint(inverse(aside.relative)), aside.own
-                columns = slice(6 * (aside.anchor - begin), 6 * (aside.anchor - begin) + 6)
-            cross = J @ P[columns]
-            own = cross[:, columns] @ J.T + noise
+            J = J[:, -len(P) :]
+            cross = J @ P[-J.shape[1] :]
+            own = cross[:, -J.shape[1] :] @ J.T + noise
             P = np.block([[P, cross.T], [cross, 0.5 * (own + own.T)]])  # what is not symmetric would grow fourfold
+            gain = np.linalg.solve(P[-6:, -6:], P[-6:])  # a pose that was solved for alone is known better
+            P = P + gain.T @ (s.spread[s.of(number)] - P[-6:, -6:]) @ gain
         rows = slice(6 * (first - begin), 6 * (last + 1 - begin))
         return first, P[rows, rows]
 
@@ -242,8 +242,11 @@ def minimised(problem: GraphProblem, iterations: int) -> gtsam.Values:
     parameters.setAbsoluteErrorTol(1e-9)
     with solving():
         before = problem.factors.error(problem.values)
-        values = gtsam.LevenbergMarquardtOptimizer(problem.factors, problem.values, parameters).optimize()
+        optimizer = gtsam.LevenbergMarquardtOptimizer(problem.factors, problem.values, parameters)
+        values = optimizer.optimize()
         after = problem.factors.error(values)
     if not np.isfinite(after) or after > before:
         raise SolverError(f"Levenberg-Marquardt found no solution (error {before:.6g} to {after:.6g})")
+    if optimizer.iterations() >= iterations:
+        logging.getLogger(__name__).warning("Levenberg-Marquardt was stopped after %d iterations", iterations)
     return values

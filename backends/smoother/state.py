@@ -45,16 +45,6 @@ class Known:
 
 
 @dataclass(frozen=True, eq=False)
-class Aside:
-    """A pose that was solved for alone, from the landmarks as they stood."""
-
-    anchor: int  # number of the pose that it is relative to
-    relative: Array  # (4, 4)
-    covariance: Array  # of that, by its measurements (6, 6)
-    own: Array  # and by the motion, too (6, 6)
-
-
-@dataclass(frozen=True, eq=False)
 class SmootherState:
     """The poses of all frames that are kept, by number, and the landmarks.
 
@@ -80,8 +70,6 @@ class SmootherState:
     turned: Array = field(default_factory=lambda: np.zeros((3, 3)))
     anchor: int = 0  # number of the last pose that gave the graph anything
     solved: int = -1  # number of the newest pose that the graph solved for; −1 for none
-    chosen: int = -1  # number of the last pose whose measurements the graph was given
-    aside: Mapping[int, Aside] = field(default_factory=dict)  # by number: poses that were solved for alone
     landmarks: SmootherLandmarks = field(default_factory=SmootherLandmarks.none)
     serials: int = 0  # number of landmarks so far
     known: Mapping[int, Known] = field(default_factory=dict)  # by serial number
@@ -149,5 +137,4 @@ class SmootherState:
             ages=self.ages[gone:], sights=self.sights[gone:], spread=self.spread[gone:],
             landmarks=self.landmarks.folded(self.first + gone, oldest),
             known={k: one for k, one in self.known.items() if not 0 <= one.pose < self.first + gone},
-            aside={k: one for k, one in self.aside.items() if k >= self.first + gone},
         )  # fmt: skip

@@ -74,9 +74,6 @@ class Tracks:
         """A pose, and its motion since the one before it, if it is not the first one."""
         if number > first:
             problem.factors.add(self._motion(s, number, first))
-        aside = s.aside.get(number)
-        if aside is not None and aside.anchor >= first:
-            problem.factors.add(self._make.tie(aside.anchor, number, aside.relative, aside.covariance))
         problem.values.insert(pose_key(number), to_pose3(problem.to_graph @ s.poses[s.of(number)]))
         problem.stamps[pose_key(number)] = float(s.ages[s.of(number)])
 

@@ -18,7 +18,7 @@ from slam.models import EstimatorModels, MotionModel, models_for
 from slam.run.replay import replay
 from slam.system import StereoSlam
 from slam.worlds import open_world
-from tests.backends.scenes import RIG, path, run, scene
+from tests.backends.scenes import RIG, cloud, observe, path, run, scene, step
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
 
@@ -53,6 +53,30 @@ def test_a_problem_that_cannot_be_solved_is_one_line(monkeypatch):
     with pytest.raises(SolverError, match="Indeterminant") as caught:
         backend.trajectory()
     assert "\n" not in str(caught.value)
+
+
+def test_far_landmarks_leave_it_its_own_covariances():
+    """One that went to infinity took those of everything away."""
+    models, rng = EstimatorModels(MotionModel(1.0, 0.3), 0.7, initial_velocity_sigma=15.0), np.random.default_rng(0)
+    poses = path(30, 0.1, np.array([0.0, 0.0, 3.0]), np.zeros(3))
+    points = np.concatenate([cloud(poses, 900, rng, 5, 40), cloud(poses, 600, rng, 1000, 2000)])
+    backend, known, points = BatchBackend(RIG, models), set(), points[rng.permutation(1500)]
+    for k, T in enumerate(poses):
+        step(backend, 0.1 * k, observe(T, points, 0.7, rng, 60), known)
+    found = backend.estimate()
+    off = se3.log(se3.inverse(found.T_world_left) @ poses[-1])
+    assert off @ np.linalg.solve(found.covariance, off) < 25
+    near = np.linalg.norm(points[found.ids] - poses[-1][:3, 3], axis=1) < 60
+    off = (found.positions - points[found.ids])[near]
+    assert np.median(np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariances[near]), off)) < 6
+
+
+def test_the_attitude_at_the_start_is_not_measured():
+    """Nothing is measured but relative to it: the motion's prior took three quarters of its variance away."""
+    data = scene(path(40, 0.1, np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.03, 0.0])), points=150)
+    backend = BatchBackend(RIG, replace(MODELS, initial_rotation_sigma=0.2))
+    run(backend, data)
+    assert np.linalg.eigvalsh(backend.estimate().covariance[:3, :3]).min() > 0.99 * 0.2**2
 
 
 @pytest.mark.parametrize(
