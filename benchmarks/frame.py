@@ -40,6 +40,7 @@ from experiments.tables import markdown, write_json
 from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError
 from slam.evaluation.metrics import absolute_errors, associate
+from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.registry import ONLINE
@@ -82,6 +83,12 @@ class Times:
         self.cpu.append(1e3 * (time.process_time() - cpu))
         self.wall.append(1e3 * (time.perf_counter() - wall))
         self.poses.append(pose)
+
+    def medians(self, counted: slice) -> Array:
+        """Of wall and CPU time over the frames that count and were tracked; of all where none was."""
+        tracked = np.array([pose is not None for pose in self.poses[counted]])
+        times = np.array([self.wall[counted], self.cpu[counted]])
+        return np.asarray(np.median(times[:, tracked] if tracked.any() else times, axis=1))
 
 
 def sizes(quick: bool) -> list[Size]:
@@ -144,15 +151,18 @@ def tracked(result: FrameResult) -> Array | None:
 
 
 def with_orbslam3(python: str, sequence: Sequence, frames: list[StereoFrame], features: int) -> Times:
-    """ORB-SLAM3's times, in a process of its own."""
+    """ORB-SLAM3's times, in a process of its own; it is given rectified images, and not charged for that."""
     with TemporaryDirectory() as name:
         folder = Path(name)
-        images = {side: np.stack([getattr(f, side) for f in frames]) for side in ("left", "right")}
+        images = {
+            side: np.stack([cv2.remap(getattr(f, side), *maps, cv2.INTER_LINEAR) for f in frames])
+            for side, maps in zip(("left", "right"), sequence.rig.rectified.maps)
+        }
         np.savez(folder / "frames.npz", **images, stamps=np.array([f.stamp for f in frames]))
         scenes = ("synthetic:aisle?frames=60", "synthetic:desk?frames=60", "synthetic:street?frames=60")
         training = (f.left for scene in scenes for f in list(open_sequence(scene).frames())[::4])
         write_vocabulary(training, folder / "vocabulary.txt")
-        (folder / "settings.yaml").write_text(settings(sequence, frames, features), encoding="ascii")
+        (folder / "settings.yaml").write_text(settings(sequence.rig.rectified.rig, frames, features), encoding="ascii")
         worker = Path(__file__).with_name("orbslam3_worker.py")
         done = subprocess.run([python, str(worker), str(folder)], capture_output=True, text=True)
         if not (folder / "result.json").is_file():
@@ -162,9 +172,9 @@ def with_orbslam3(python: str, sequence: Sequence, frames: list[StereoFrame], fe
     return Times(found["wall"], found["cpu"], poses)
 
 
-def settings(sequence: Sequence, frames: list[StereoFrame], features: int) -> str:
-    """ORB-SLAM3's settings in their old form: real numbers have a point."""
-    camera, rig = sequence.rig.left, sequence.rig
+def settings(rig: StereoRig, frames: list[StereoFrame], features: int) -> str:
+    """ORB-SLAM3's settings for a rectified rig in their old form: real numbers have a point."""
+    camera = rig.left
     rate = (len(frames) - 1) / (frames[-1].stamp - frames[0].stamp)
     values = {
         "Camera.type": '"PinHole"', "Camera.fx": camera.fu, "Camera.fy": camera.fv, "Camera.cx": camera.u0,
@@ -185,7 +195,7 @@ def rows(size: Size, times: dict[str, Times]) -> Iterable[list[str]]:
     """A row for each, medians over the frames that count."""
     sequence, last = open_sequence(size.sequence), slice(size.skipped, None)
     stamps = np.array([f.stamp for f in sequence.frames(0, size.skipped + size.counted)])
-    medians = {name: np.median([t.wall[last], t.cpu[last]], axis=1) for name, t in times.items()}
+    medians = {name: t.medians(last) for name, t in times.items()}
     for name, t in times.items():
         ratios = [medians[name] / medians[other] if other in medians else None for other in (SIFT, ORBSLAM3)]
         seen = np.array([p is not None for p in t.poses])

@@ -75,10 +75,8 @@ class AssociationCheck:
 
     def add(self, k: int, result: FrameResult) -> None:
         """Take in what was made of the world's frame k."""
-        uv = result.features.uv_left
-        off = self._points.errors(k, result.matched, uv[result.matched_features])
-        self._right, self._known = self._right + int((off < 3).sum()), self._known + int((~np.isnan(off)).sum())
-        self._points.add(k, result.added, uv[result.added_features])
+        off = self._points.of_matches(k, result)
+        self._right, self._known = self._right + int((off < 3).sum()), self._known + len(off)
 
     @property
     def share(self) -> float:

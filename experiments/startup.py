@@ -84,7 +84,7 @@ def stored_map(sequence: WorldSequence) -> SavedMap:
     return SavedMap(
         ids, positions[ids] + noise, np.tile(KNOWN**2 * np.eye(3), (len(ids), 1, 1)),
         np.array([seen[i] for i in ids.tolist()], np.float32), np.array([signs[i] for i in ids.tolist()], np.int8),
-        ones, ones, world_frame="the board's middle: x right, y away from the camera, z up",
+        ones, ones,
     )  # fmt: skip
 
 

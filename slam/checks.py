@@ -49,14 +49,14 @@ def require_not_measured(owner: str, measured: bool) -> None:
 
 
 def is_rigid(T: Array, tolerance: float) -> bool:
-    """Whether T (4, 4) is a rotation and a translation, as far as a double can tell what a camera sees there."""
-    near = T.shape == (4, 4) and bool((np.abs(T) <= FARTHEST_POSITION).all())  # false for NaN, too
-    return near and bool(is_rotation(T[:3, :3], tolerance))
+    """Whether T (..., 4, 4) are rotations and translations, as far as a double can tell what a camera sees there."""
+    near = bool((np.abs(T) <= FARTHEST_POSITION).all())  # false for NaN, too
+    return near and bool(is_rotation(T[..., :3, :3], tolerance).all())
 
 
 def require_guess(owner: str, guess: Array | None) -> None:
     """Raise MeasurementError where a guess of the camera's pose is no rigid motion (4, 4)."""
-    fine = guess is None or (isinstance(guess, np.ndarray) and is_rigid(guess, 1e-3))
+    fine = guess is None or (isinstance(guess, np.ndarray) and guess.shape == (4, 4) and is_rigid(guess, 1e-3))
     if not fine or (guess is not None and (guess[3] != (0, 0, 0, 1)).any()):
         raise MeasurementError(f"{owner}: the guess must be an array (4, 4): a rotation and a translation")
 

@@ -18,6 +18,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
+from slam.third_party import checked
 
 
 def guarded(backend: Any) -> Any:
@@ -114,7 +115,7 @@ class _Guarded:
         asked = np.array(self._require(ids), np.int64)
         if hasattr(self._backend, "positions"):
             return np.array(self._backend.positions(asked))
-        found = self._backend.estimate()
+        found: Estimate = checked(self, "estimate", self._backend.estimate())
         return np.array(found.positions[LandmarkRows(found.ids).rows_of(asked)])
 
     def estimate(self, landmarks: bool = True) -> Estimate:

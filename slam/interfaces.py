@@ -137,8 +137,8 @@ class RestingBackend(Protocol):
 class RecentBackend(Protocol):
     """Additional method of a back end that knows how the errors of the camera's last poses hang together.
 
-    Moving bodies need it: a velocity is the difference of two poses. Of a back end without it the joint covariance is
-    derived from the poses' own ones, and errors count as dead reckoning's where covariances are judged.
+    Moving bodies need it, a velocity is the difference of two poses, and so does the judgement of covariances. Of a
+    back end without it the joint covariance is derived from the poses' own ones (`slam.third_party.derived_recent`).
     """
 
     def recent(self, n: int) -> RecentPoses:

@@ -195,7 +195,7 @@ class EstimatorModels:
                 T = np.array(self.T_world_left, float)
             except (TypeError, ValueError, OverflowError):
                 T = np.zeros(0)
-            if not is_rigid(T, 1e-6):  # to within the rounding of six digits
+            if T.shape != (4, 4) or not is_rigid(T, 1e-6):  # to within the rounding of six digits
                 raise ConfigurationError("T_world_left must be a (4, 4) pose: a rotation and a translation")
             object.__setattr__(self, "T_world_left", tuple(map(tuple, T.tolist())))
 

@@ -91,7 +91,7 @@ class Session:
             T = place.T_odom_left
         self._tracker.mapper.next_id = saved.next_id
         new, tracks = self._start(state.tracks, T, (saved.ids, saved.positions, saved.covariances), place)
-        return replace(state, backend=new, tracks=tracks, prior_map=None)
+        return replace(state, backend=new, tracks=tracks, prior_map=None, online=())
 
     def not_found(self, state: State, features: StereoFeatures) -> tuple[State, FrameResult]:
         """State and result after a frame in which the camera was not found in the prior map."""
@@ -145,7 +145,7 @@ class Session:
         path = old.trajectory().select(slice(None, -1))
         hidden = elsewhere.T_world_left is None and state.tracking.stood and self._config.models.motion.wheels
         state = replace(
-            state, backend=new, tracks=tracks, atlas=atlas, standing=standing,
+            state, backend=new, tracks=tracks, atlas=atlas, standing=standing, online=(),
             tracking=state.tracking.believing(T, stamp, T if hidden else None), past=(*state.past, path),
             restarted=(*state.restarted, state.index + 1),
         )  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 
 from slam import registry
 from slam.atlas.atlas import Atlas
-from slam.atlas.map_io import FIRST_FRAME, SavedMap
+from slam.atlas.map_io import SavedMap
 from slam.bodies.detector import MovingObjectDetector, ObjectDetector
 from slam.calibration import SavedCalibration, SelfCalibration
 from slam.config import SystemConfig
@@ -115,7 +115,6 @@ class StereoSlam:
         self.frontend: Frontend | None = registry.require_methods("frontends", frontend)
         first: Backend = registry.require_methods("backends", backend)
         self.frontend_name = names[0] or ""
-        self.world_frame = FIRST_FRAME if prior_map is None else prior_map.world_frame
         inside.require_fits(first)
         self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
         kinds = {"off": lambda *_: ObjectDetector(), "detect": MovingObjectDetector, "procedure1": Procedure1Detector}
@@ -343,7 +342,7 @@ class StereoSlam:
             rows = replace(rows, seen_from=transform(self.atlas.T_map_odom, rows.seen_from))
             keyframes = (k.corrected(self.calibration.applied, self._tracker.rig) for k in self.atlas.keyframes)
             atlas = replace(self.atlas, keyframes=tuple(keyframes))
-            return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, atlas, self.rig)
+            return SavedMap.of(rows, estimate, self.frontend_name, atlas, self.rig)
 
     @property
     def warnings(self) -> list[str]:

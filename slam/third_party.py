@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
 from numbers import Real
 from traceback import walk_tb
 from typing import Any
@@ -11,10 +13,14 @@ from typing import Any
 import numpy as np
 
 from slam.checks import LATEST_STAMP, is_rigid
-from slam.data import Estimate, Patches, Prediction, RecentPoses, UpdateReport, UpdateStatus
+from slam.data import Estimate, Observations, Patches, Prediction, RecentPoses, UpdateReport, UpdateStatus
 from slam.errors import AnswerError, PartError, SlamError, cause
+from slam.geometry.rig import MINIMAL_POINTS, StereoRig
+from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
+from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, RecentBackend
 
+_LEAST = 1e-12 * np.eye(6)  # numerics: variances [rad²], [m²] of a pose that is known for certain
 _OURS = ("slam", "backends", "frontends", "builtins")
 
 #: What each method answers: a type, and the types or shapes of its attributes. Equal letters stand for equal numbers,
@@ -28,6 +34,7 @@ _ANSWERS: dict[str, tuple[type, dict[str, Any]]] = {
     "estimate": (Estimate, {**_POSE, "positions": ("n", 3), "covariances": ("n", 3, 3)}),
     "recent": (RecentPoses, {"stamps": ("k",), "poses": ("k", 4, 4), "covariance": ("6k", "6k")}),
     "positions": (np.ndarray, {"real": ("n", 3)}),
+    "trajectory": (Trajectory, {}),  # which checks itself
     "patches": (Patches, {"images": ("n", "s", "s"), "centres": ("n", 2), "size": ("n",)}),
     "align": (tuple, {}),
 }
@@ -62,7 +69,7 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
                 raise AnswerError(f"{where} must be an array of ids, got {value.dtype}")
             if name in _FINITE and not np.isfinite(value).all():
                 raise AnswerError(f"{where} is not finite")
-            if name in _POSES and not all(is_rigid(T, 1e-3) for T in value.reshape(-1, 4, 4)):
+            if name in _POSES and not is_rigid(value, 1e-3):
                 raise AnswerError(f"{where} is no rotation and translation")
             if name in _COVARIANCES and (value.diagonal(0, -2, -1) < -1e-9).any():  # 1e-9: rounding
                 raise AnswerError(f"{where} has a negative variance")
@@ -73,9 +80,65 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
     return answer
 
 
-def recent_of(backend: Backend, n: int) -> RecentPoses | None:
-    """The last poses of a back end, at most n, checked; None of one that does not tell them."""
-    return checked(backend, "recent", backend.recent(n)) if isinstance(backend, RecentBackend) else None
+@dataclass(frozen=True, eq=False)
+class OnlinePose:
+    """The camera's pose in a frame as it was estimated then."""
+
+    rig: StereoRig
+    sigma: float  # pixel noise [px]
+    estimate: Estimate
+    landmarks: Array  # that measured it, in camera coordinates (M, 3) [m]
+
+    @classmethod
+    def seen(cls, rig: StereoRig, sigma: float, estimate: Estimate, seen: Observations) -> OnlinePose:
+        """By what was measured of landmarks."""
+        local = rig.triangulate(seen.uv_left, seen.uv_right)
+        return cls(rig, sigma, estimate, local[np.isfinite(local[:, 0])])
+
+    @cached_property
+    def noise(self) -> Array:
+        """Covariance (6, 6) by the frame's own noise: what the landmarks would leave uncertain if they were known.
+
+        A pose that too few have measured to determine it has the error that was before, and what the motion added.
+        """
+        if len(self.landmarks) < MINIMAL_POINTS:
+            return np.zeros((6, 6))
+        J = (self.rig.project_stereo(self.landmarks)[1] @ points_by_pose(self.landmarks)).reshape(-1, 6)
+        return np.linalg.inv(np.linalg.inv(self.estimate.covariance + _LEAST) + J.T @ J / self.sigma**2)
+
+
+def recent_of(backend: Backend, path: Sequence[OnlinePose]) -> RecentPoses:
+    """The last poses of a back end, as many as in the path at most, checked; derived where it does not tell them."""
+    if isinstance(backend, RecentBackend):
+        told: RecentPoses = checked(backend, "recent", backend.recent(len(path)))
+        return told
+    return derived_recent(path)
+
+
+def derived_recent(path: Sequence[OnlinePose]) -> RecentPoses:
+    """The last poses together, of a back end that does not tell how their errors hang together.
+
+    Each pose's error is one that goes on with the camera and grows with time, and the noise of its own frame. So two
+    poses have in common what the earlier one is off by without its noise; where a pose became surer, as at an old
+    place, no more than the later one is off by.
+    """
+    stamps = np.array([one.estimate.stamp for one in path])
+    poses, P = np.stack([one.estimate.T_world_left for one in path]), np.zeros((6 * len(path), 6 * len(path)))
+    common = np.zeros((6, 6))
+    for i, one in reversed(list(enumerate(path))):
+        lasting = one.estimate.covariance - one.noise
+        if i + 1 < len(path):
+            back = adjoint(inverse(poses[i]) @ poses[i + 1])
+            values, axes = np.linalg.eigh(back @ common @ back.T)
+            deviations = np.sqrt(values.clip(min=_LEAST[0, 0]))
+            shares, turn = np.linalg.eigh((axes / deviations).T @ lasting @ (axes / deviations))
+            axes = (axes * deviations) @ turn
+            lasting = (axes * shares.clip(0.0, 1.0)) @ axes.T
+        common, own = lasting, slice(6 * i, 6 * i + 6)
+        P[own, 6 * i :] = common @ adjoint(inverse(poses[i:]) @ poses[i]).reshape(-1, 6).T
+        P[6 * i :, own] = P[own, 6 * i :].T
+        P[own, own] = common + one.noise
+    return RecentPoses(stamps, poses, P)
 
 
 @contextmanager

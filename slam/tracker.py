@@ -33,12 +33,12 @@ from slam.data import (
 )  # fmt: skip
 from slam.geometry.arrays import Array, changed, isin
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig
-from slam.geometry.se3 import inverse
+from slam.geometry.se3 import inverse, twice
 from slam.geometry.trajectory import Trajectory
 from slam.input.warnings import REPEATED
 from slam.interfaces import AligningFrontend, Backend, Frontend, MapBackend, RestingBackend
 from slam.object_data import MovingObject
-from slam.third_party import checked, recent_of
+from slam.third_party import OnlinePose, checked, recent_of
 from slam.tracks.alignment import align, take_patches
 from slam.tracks.localizer import Localizer, Search, median_deviation
 from slam.tracks.mapper import Mapper
@@ -65,6 +65,7 @@ class State:
     checksum: tuple[int, int] | None = None  # of the images; None without images, or of images that show nothing
     # in which the camera has not been found yet; None without one, or once it is found
     prior_map: SavedMap | None = None
+    online: tuple[OnlinePose, ...] = ()  # the last poses of the present back end, as estimated in their time
     past: tuple[Trajectory, ...] = ()  # the paths of all back ends before the present one
     restarted: tuple[int, ...] = ()  # indices of the frames in which another back end took over
 
@@ -76,7 +77,7 @@ class State:
         """The state after one more frame."""
         located = not step.tracking.unmeasured or not self.ever_mapped or self.begins_at(step.index)
         return changed(
-            self, tracks=step.tracks, atlas=atlas, index=step.index, tracking=step.tracking,
+            self, tracks=step.tracks, atlas=atlas, index=step.index, tracking=step.tracking, online=step.online,
             standing=changed(step.standing, T_world_left=step.estimate.T_world_left),
             checksum=checksum, ever_mapped=self.ever_mapped or len(step.added) > 0,
             dimensions=step.features.descriptors.shape[1] if len(step.features) else self.dimensions,
@@ -85,7 +86,7 @@ class State:
 
     def path(self) -> Trajectory:
         """The path by all back ends so far, in their frame."""
-        return Trajectory.joined([*self.past, self.backend.trajectory()])
+        return Trajectory.joined([*self.past, checked(self.backend, "trajectory", self.backend.trajectory())])
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,8 +225,11 @@ class Tracker:
         """The camera's pose after an update; the rig's calibration learns from the frame."""
         self.calibration.observe(changed(step.measured, images=None), step.pose)
         estimate: Estimate = checked(state.backend, "estimate", state.backend.estimate(landmarks=False))
-        recent = recent_of(state.backend, FRAMES + 1)
-        return changed(step, estimate=estimate, recent=recent)
+        seen = step.matches.observations(step.features)
+        seen = seen.select(np.isin(seen.ids, step.report.used))
+        online = OnlinePose.seen(self.rig, self.config.models.pixel_sigma, estimate, seen)
+        path = (*state.online[-FRAMES:], online)
+        return changed(step, estimate=estimate, online=path, recent=recent_of(state.backend, path))
 
     def classify(self, state: State, step: Step) -> Step:
         """Which features move, and the moving bodies."""
@@ -304,7 +308,7 @@ def frame_result(
 
 def _in_map(thing: MovingObject, T_map_odom: Array) -> MovingObject:
     """A body in the map's coordinates; of its covariances only the velocity's changes, the pose's is in body axes."""
-    e, R = thing.estimate, np.kron(np.eye(2), T_map_odom[:3, :3])
+    e, R = thing.estimate, twice(T_map_odom[:3, :3])
     motion, since = (T_map_odom @ T @ inverse(T_map_odom) for T in (thing.motion, thing.motion_since_found))
     pose, P = T_map_odom @ e.T_world_object, R @ e.velocity_covariance @ R.T
     estimate = replace(e, T_world_object=pose, velocity=R @ e.velocity, velocity_covariance=P)

@@ -8,12 +8,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiments.ablation_parts import CASES, RECORDED
+from experiments.ablation_parts import RECORDED
 from experiments.bars import ROOM, bars, errors, perturbed
 from frontends import create
 from slam.config import SystemConfig
-from slam.run.options import RunOptions
-from slam.run.runner import run
 from slam.sequences import open_sequence
 
 pytestmark = pytest.mark.slow
@@ -53,12 +51,3 @@ def test_the_median_is_that_measured_where_single_runs_scatter(slam_data, case):
             found, _ = errors(case, sequence, *seen, backend)
             ratios.append([ROOM * found[path] / allowed[path] for path in allowed])
     assert (np.median(ratios, axis=0) < ROOM).all()
-
-
-def test_the_same_run_twice_is_the_same_to_the_byte(slam_data, tmp_path):
-    sequence = open_sequence(slam_data / CASES[0].path)
-    config = SystemConfig.for_kind(sequence.kind)
-    for name in ("a", "b"):
-        run(sequence, RunOptions("smoother", "surf", config, tmp_path / name, 0, 12))
-    for file in ("trajectory.txt", "trajectory_final.txt", "landmarks.csv"):
-        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()

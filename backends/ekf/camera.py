@@ -8,7 +8,8 @@ much says `Camera.displacement`. What a displacement of the world changes in a l
 
 from __future__ import annotations
 
-from typing import Protocol, Self
+from collections.abc import Sequence
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from slam.models import ANYWHERE, EstimatorModels
 _ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an attitude [rad]
 
 _AT_REST = np.diag(np.repeat([1.0, 0.0], POSE))  # of a camera's error (12,)
+_POSITION = np.diag(np.repeat([1.0, 0.0, 0.0, 0.0], 3))  # of it that of the position
 
 
 class Camera(Protocol):
@@ -77,39 +79,34 @@ def predicted(camera: Camera, models: EstimatorModels, P: Array, dt: float, rest
     """A camera with the error's covariance P (12, 12), after `dt` [s]: ``A P Aᵀ + W Q Wᵀ`` (paper B, section 2).
 
     One that rests keeps its pose, and its velocity is zero for certain. One that may have turned anyhow meanwhile stays
-    where it is, with an error that has nothing to do with the map.
+    where it is, as uncertain as the prior of the speed makes it; of its error only that of the position has to do with
+    the map still. Larger numbers would mean nothing, and leave a double too few digits for the map.
     """
     if rests:
         return camera.stopped(), _AT_REST, np.zeros_like(P)
-    anyhow = _after_gap(models, P, dt)
-    if anyhow is not None:
-        return camera.stopped(), np.zeros_like(P), camera.of_body(anyhow)
+    if _any_attitude(models, P, dt):
+        sigmas = min(models.initial_velocity_sigma * dt, ANYWHERE), np.pi / np.sqrt(3), *_velocity_sigmas(models)
+        return camera.stopped(), _POSITION, camera.of_body(diagonal(sigmas))
     camera, A, W = camera.advanced(dt)
     return camera, A, (W * np.repeat(models.motion.velocity_variance(dt), 3)) @ W.T
 
 
 def prior(models: EstimatorModels) -> Array:
     """The first camera's covariance (12, 12) of position, attitude, velocity, and body rate."""
-    sigmas = (
-        models.initial_position_sigma, models.initial_rotation_sigma,
-        models.initial_velocity_sigma, models.initial_angular_velocity_sigma,
-    )  # fmt: skip
+    return diagonal((models.initial_position_sigma, models.initial_rotation_sigma, *_velocity_sigmas(models)))
+
+
+def _velocity_sigmas(models: EstimatorModels) -> tuple[float, float]:
+    return models.initial_velocity_sigma, models.initial_angular_velocity_sigma
+
+
+def diagonal(sigmas: Sequence[Any]) -> Array:
+    """Covariance (12, 12) of three numbers for each of four standard deviations."""
     return np.diag(np.repeat(np.array(sigmas) ** 2, 3))
 
 
-def _after_gap(models: EstimatorModels, P: Array, dt: float) -> Array | None:
-    """Covariance (12, 12) of a camera that may have turned anyhow in the last `dt` [s]; None where it may not.
-
-    P (12, 12) is that before, of position, attitude, velocity, and rate, in the camera's own numbers; what is returned
-    is about the body's axes. The position is as uncertain as the prior of the speed makes it meanwhile. Larger numbers
-    would mean nothing, and leave a double too few digits for the map.
-    """
+def _any_attitude(models: EstimatorModels, P: Array, dt: float) -> bool:
+    """Whether a camera with the error's covariance P (12, 12) may have turned anyhow in the last `dt` [s]."""
     attitude, rate = np.arange(3, 6), np.arange(9, 12)
     variance = P[attitude, attitude] + 2 * dt * P[attitude, rate] + dt * dt * P[rate, rate]
-    if variance.max() + dt * dt * models.motion.velocity_variance(dt)[1] <= _ANY_ATTITUDE**2:
-        return None
-    after = prior(models)
-    after[:3, :3] = P[:3, :3] + (models.initial_velocity_sigma * dt) ** 2 * np.eye(3)
-    after[:3, :3] *= min(1.0, ANYWHERE**2 / after[:3, :3].diagonal().max())
-    after[3:6, 3:6] = np.pi**2 / 3 * np.eye(3)
-    return after
+    return bool(variance.max() + dt * dt * models.motion.velocity_variance(dt)[1] > _ANY_ATTITUDE**2)

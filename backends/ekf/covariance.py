@@ -19,12 +19,13 @@ from scipy.linalg.blas import dsyr2k, dsyrk
 
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
+from slam.runtime.compilation import kernel
 
 CAMERA = 12  #: fixed: size of the camera's state [r, φ, v, ω]
 POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 RECENT = 4  #: cost: poses before the present one that are kept
 HEAD = CAMERA + POSE * RECENT  #: fixed: size of camera and last poses, behind which the landmarks stand
-_BLOCK = 64  # cost: rows that are mirrored at once
+_BLOCK = 32  # cost: rows and columns that are mirrored at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,10 +90,14 @@ class Covariance:
 
     # --- the camera moves ---
 
-    def camera_moved(self, J: Array, noise: Array, by_error: Array | None = None) -> Covariance:
+    def camera_moved(
+        self, J: Array, noise: Array, by_error: Array | None = None, rows: IndexArray | None = None,
+        slide: Array | None = None,
+    ) -> Covariance:  # fmt: skip
         """The camera's error (12,) becomes J times what it was, plus noise (12, 12).
 
         With `by_error`, the pose before, that (6, 6) times [r, φ], is now the first of the last ones; the last goes.
+        Some landmarks (`rows` (M,) of the table) have more noise then, `slide` (M, 3, 3).
         """
         F = np.eye(HEAD) if by_error is None else np.eye(HEAD, k=-POSE)
         F[:CAMERA, :CAMERA] = J
@@ -104,17 +109,15 @@ class Covariance:
         own[:CAMERA, :CAMERA] += noise
         P[:HEAD, :HEAD] = 0.5 * (own + own.T)
         P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
-        return replace(self, P=P, by_rig=by_rig)
+        known = self.known
+        if rows is not None and slide is not None:
+            there, known = rows < self.correlated, known.copy()
+            at = self.numbers(rows[there])
+            P[at[:, :, None], at[:, None, :]] += slide[there]
+            known[rows[~there] - self.correlated] += slide[~there]
+        return Covariance(P, by_rig, known)
 
     # --- landmarks join and leave ---
-
-    def widened(self, rows: IndexArray, noise: Array) -> Covariance:
-        """With more noise (M, 3, 3) of some landmarks, by rows of the table."""
-        P, known, there = self.P.copy(), self.known.copy(), rows < self.correlated
-        at = self.numbers(rows[there])
-        P[at[:, :, None], at[:, None, :]] += noise[there]
-        known[rows[~there] - self.correlated] += noise[~there]
-        return replace(self, P=P, known=known)
 
     def appended(self, J: Array, noise: Array, by_rig: Array) -> Covariance:
         """With landmarks ``Y = g(r, φ) + noise`` (paper A, Eq. 10), by derivatives (M, 3, 6) and covariances (M, 3, 3).
@@ -133,29 +136,31 @@ class Covariance:
     def rearranged(self, rows: IndexArray, known: IndexArray) -> Covariance:
         """With other landmarks in each of its two parts, or fewer; by their rows of the table of landmarks."""
         joining = np.flatnonzero(rows >= self.correlated)
-        numbers = np.append(np.arange(HEAD), self.numbers(rows)).clip(max=len(self.P) - 1)
-        P = np.ascontiguousarray(self.P[numbers].T)[numbers]  # rows alone are copied fast
-        by_rig, at = self.by_rig[numbers], self.numbers(joining)
-        P[at], P[:, at], by_rig[at] = 0.0, 0.0, 0.0
+        numbers, at = np.append(np.arange(HEAD), self.numbers(rows)), self.numbers(joining)
+        numbers[at] = -1
+        P, by_rig = reordered(self.P, numbers), self.by_rig[numbers]
+        by_rig[at] = 0.0
         P[at[:, :, None], at[:, None, :]] = self.known[rows[joining] - self.correlated]
         return replace(self, P=P, by_rig=by_rig, known=self.known[known - self.correlated])
 
     # --- an update ---
 
-    def corrected(self, V: Array, lost_by_rig: Array, J: Array, shift: Array) -> Covariance:
-        """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ = P − V Vᵀ`` (paper A, Eq. 11).
+    def corrected(self, V: Array, U: Array, by_rig: Array, J: Array, shift: Array) -> Covariance:
+        """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ`` (paper A, Eq. 11).
 
         The last poses keep the covariance that they have among themselves.
 
         Args:
-            V: ``P Hᵀ L⁻ᵀ`` (n, 3M), with ``S = L Lᵀ``.
-            lost_by_rig: L⁻¹ times derivatives (3M, m) of the innovation by errors of the rig.
+            V: (n, ·) and
+            U: (n, ·) with ``K S Kᵀ = V Vᵀ − U Uᵀ``.
+            by_rig: what errors of the rig change in the update (n, m), as derivatives.
             J: the camera's error becomes J (12, 12) times what it was,
             shift: and then to those of the landmarks this (N, 3, 6) times that of the pose is added.
         """
-        last, by_rig, M = slice(CAMERA, HEAD), self.by_rig - V @ lost_by_rig, np.zeros((len(self.P), CAMERA))
+        last, by_rig, M = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), CAMERA))
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
-        P[:CAMERA, :CAMERA] = mirrored(P[:CAMERA, :CAMERA])
+        P = dsyrk(1.0, U, 1.0, P.T, overwrite_c=1).T if U.size else P
+        mirror(P[:CAMERA, :CAMERA])
         M[:CAMERA], M[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
         half = 0.5 * M @ P[:CAMERA, :CAMERA]  # T = 1 + [M, 0]:  T P Tᵀ = P + M Yᵀ + Y Mᵀ,  Y = P[:, :12] + M P_cc / 2
         P = dsyr2k(1.0, M, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
@@ -163,7 +168,8 @@ class Covariance:
         P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]
         summands = self.P.diagonal() + 2 * (half * M).sum(axis=1)
         summands[last] = 0.0
-        return replace(self, P=positive(mirrored(P), summands, V.shape[1]), by_rig=by_rig)
+        mirror(P)
+        return replace(self, P=positive(P, summands, V.shape[1]), by_rig=by_rig)
 
     def displaced(self, rows: IndexArray, change: Array, shift: Array) -> Covariance:
         """After a change (M, 3) of some landmarks' coordinates that is none of their error, with a shift as above.
@@ -172,16 +178,30 @@ class Covariance:
         """
         by_rig = self.by_rig.copy()
         by_rig[self.numbers(rows).ravel(), -1:] -= change.reshape(-1, 1)
-        nothing = np.zeros((len(self.P), 0)), np.zeros((0, by_rig.shape[1]))
-        return replace(self, by_rig=by_rig).corrected(*nothing, np.eye(CAMERA), shift)
+        nothing = np.zeros((len(self.P), 0))
+        return replace(self, by_rig=by_rig).corrected(nothing, nothing, 0 * by_rig, np.eye(CAMERA), shift)
 
 
-def mirrored(P: Array) -> Array:
-    """P (n, n) with its lower triangle also above the diagonal, in place."""
-    for i in range(0, len(P), _BLOCK):
-        own, below = P[i : i + _BLOCK, i : i + _BLOCK], P[i + _BLOCK :, i : i + _BLOCK]
-        own[:], P[i : i + _BLOCK, i + _BLOCK :] = np.tril(own) + np.tril(own, -1).T, below.T
-    return P
+@kernel
+def mirror(P: Array) -> None:
+    """The lower triangle of P (n, n) also above its diagonal, in place."""
+    n = len(P)
+    for first in range(0, n, _BLOCK):
+        for left in range(0, first + 1, _BLOCK):
+            for i in range(first, min(first + _BLOCK, n)):
+                for j in range(left, min(left + _BLOCK, i)):
+                    P[j, i] = P[i, j]
+
+
+@kernel
+def reordered(P: Array, order: IndexArray) -> Array:
+    """P (n, n) with its rows and columns in an order (k,); those of a negative number are zero."""
+    out = np.zeros((len(order), len(order)))
+    for i in range(len(order)):
+        for j in range(len(order) if order[i] >= 0 else 0):
+            if order[j] >= 0:
+                out[i, j] = P[order[i], order[j]]
+    return out
 
 
 def positive(P: Array, summands: Array, terms: int) -> Array:

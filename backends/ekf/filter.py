@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from backends.ekf.camera import Camera, predicted
+from backends.ekf.camera import Camera, Motion, predicted
 from backends.ekf.covariance import CAMERA, POSE, RECENT, Covariance, positive
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
-from backends.ekf.recovery import agreement
+from backends.ekf.solve import agreement
 from backends.ekf.state import FilterState
 from slam.checks import known_landmarks, require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
@@ -28,6 +28,7 @@ from slam.window.stereo import TOO_LATE, Field, RectifiedMeasurement
 
 #: Standard deviations of a known point between it and its anchor: its coordinates are linear there, it stays Gaussian.
 _STAND_OFF = 100.0
+_UNCOUNTED = 0.1  # cost: variance of a slide that is not counted yet, as a share of the noise of a pixel
 _DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large
 
 
@@ -60,6 +61,11 @@ class LandmarkFilter:
         self.rig, self.models = rig, models
         self._coordinates, self._iterations, self._stereo = coordinates, iterations, stereo
         self._measure = RectifiedMeasurement(rig, models.with_slide())
+        self._slide: tuple[float, ...] = (0.0,)  # see `FilterState.advanced`
+        if density := models.slide.density:
+            noise = self._measure.models.pixel_sigma**2
+            angles = np.array([models.pixel_sigma**2 - noise, _UNCOUNTED * noise]) / density**2
+            self._slide = density / self._measure.stereo.f, *angles.tolist()
         self.state = FilterState.first(camera, P)
         self._past: list[tuple[float, Array]] = []  # stamps and poses before the state's
 
@@ -79,9 +85,9 @@ class LandmarkFilter:
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         s = self._started("update")
-        require_not_measured(self.name, s.closed)
+        require_not_measured(self.name, s.measured)
         require_guess(self.name, guess)
-        s = replace(s.with_all_of(observations.ids), closed=True)
+        s = replace(s.with_all_of(observations.ids), measured=True)
         s, report = self._updated(s, observations, guess)
         self.state = s
         return report
@@ -141,8 +147,9 @@ class LandmarkFilter:
         anchors = np.tile(np.eye(3, 4), (len(ids), 1, 1))
         anchors[:, :, 3] = positions
         anchors[:, 2, 3] -= np.maximum(_STAND_OFF * np.sqrt(np.trace(covariances, axis1=1, axis2=2)), 1.0)
-        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, np.pi)
-        D = self._coordinates.inverse_jacobian(anchors, new.c)
+        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions)
+        new = replace(new, sights=np.full((len(ids), 3), np.nan))
+        D = new.gauge[:, :, :3]
         self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
 
     @one_blas_thread
@@ -183,7 +190,7 @@ class LandmarkFilter:
         were corrected before, and seen at pixels as they are now, would look as if the camera had moved. Those of a
         prior map that were not measured yet were placed by no pixels: they stay.
         """
-        s, stereo = replace(self.state, closed=True), self._measure.stereo
+        s, stereo = replace(self.state, measured=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
             z, _ = stereo.project(se3.transform(se3.inverse(s.pose), s.landmarks.points))
             rows = np.flatnonzero(self.rig.left.in_image(z[:, :2])[: s.covariance.correlated])
@@ -205,17 +212,16 @@ class LandmarkFilter:
     def _predicted(self, stamp: float, rests: bool) -> Prediction:
         """Go to a time, and say what is in the angle of view then; whether the camera rests meanwhile.
 
-        Features slide as the viewpoint changes: this widens the landmarks in view (`FilterState.slid`).
+        Features slide as the viewpoint changes: this widens the landmarks in view (`FilterState.advanced`).
         """
         s = self.state
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
-        if s.frame < 0:
-            after = replace(s, stamp=float(stamp), frame=0, closed=False)
-        else:
+        motion: Motion = s.camera, np.eye(CAMERA), np.zeros((CAMERA, CAMERA))
+        if s.frame >= 0:
             motion = predicted(s.camera, self.models, s.covariance.camera, stamp - s.stamp, rests)
-            after = s.advanced(float(stamp), motion)
-        T, rows = after.pose, self._measure.visible(after.pose, after.landmarks.points)
-        after = after.slid(self._coordinates, rows, self.models.slide.density / self._measure.stereo.f)
+        T = motion[0].pose
+        rows = self._measure.visible(T, s.landmarks.points)
+        after = s.advanced(float(stamp), motion, rows, *self._slide)
         marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
         by_pose = -toward @ (marks.gauge @ after.camera.displacement())  # (M, 3, 6), of them as seen from the camera
@@ -254,10 +260,10 @@ class LandmarkFilter:
             after = s.corrected(found)
         except LinAlgError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self.name}: {error}")
-        used, w = found.used, found.w
+        used = found.used
         dof, ids = int(np.isfinite(z[used]).sum()), observations.ids
         reason = "" if found.linear else f"{self.name}: not linear after {self._iterations} iterations"
-        return after, UpdateReport(UpdateStatus.OK, reason, ids[used], ids[~used], float(w @ w), dof)
+        return after, UpdateReport(UpdateStatus.OK, reason, ids[used], ids[~used], found.nis, dof)
 
     def _started(self, what: str) -> FilterState:
         if self.state.frame < 0:

@@ -52,13 +52,8 @@ class Update:
 
     @cached_property
     def numbers(self) -> IndexArray:
-        """Where pose and coordinates of the measured landmarks (6 + 3M,) stand in the covariance."""
+        """Where pose and coordinates of the measured landmarks (6 + 3M,) stand among the errors of the covariance."""
         return np.append(np.arange(POSE), self.covariance.numbers(self.rows))
-
-    @cached_property
-    def measured(self) -> IndexArray:
-        """And in a change of the state (12 + 3N,), which is of the camera and the landmarks in it."""
-        return np.append(np.arange(POSE), self.numbers[POSE:] - HEAD + CAMERA)
 
     @cached_property
     def lever(self) -> Array:
@@ -78,8 +73,8 @@ class Update:
         return np.linalg.solve(N.T @ Z, Z.T) if np.isfinite(Z).all() else None
 
     def predicted(self, camera: Camera, change: Array) -> Array:
-        """What a camera would measure (M, 3) [px] of landmarks if the state changes (12 + 3N,); NaN behind it."""
-        marks, asked = self.landmarks, change[self.measured[POSE:]].reshape(-1, 3)
+        """What a camera would measure (M, 3) [px] of landmarks if the state changes (n,); NaN behind it."""
+        marks, asked = self.landmarks, change[self.numbers[POSE:]].reshape(-1, 3)
         points = self.coordinates.points(marks.anchors, self.coordinates.moved(marks.c, asked))
         return self.measure.stereo.project((points - camera.pose[:3, 3]) @ camera.pose[:3, :3])[0]
 
@@ -90,14 +85,14 @@ class Update:
         """
         there, marks = camera or self.camera, self.landmarks
         J = np.eye(CAMERA) if camera is None else self.camera.transport(camera)
-        change = np.zeros(CAMERA + len(self.covariance.P) - HEAD)
+        change = np.zeros(len(self.covariance.P))
         if camera is not None:
             change[:CAMERA] = np.linalg.solve(J, there.minus(self.camera))
         if moved is not None:
-            change[CAMERA:] = moved
-            asked = change[self.measured[POSE:]].reshape(-1, 3)
+            change[HEAD:] = moved
+            asked = change[self.numbers[POSE:]].reshape(-1, 3)
             marks = marks.moved(self.coordinates, slice(None), asked)
-            change[self.measured[POSE:]] = (marks.c - self.landmarks.c).reshape(-1)  # a coordinate may be at its limit
+            change[self.numbers[POSE:]] = (marks.c - self.landmarks.c).reshape(-1)  # a coordinate may be at its limit
         R, r = there.pose[:3, :3], there.pose[:3, 3]
         z, by_point = self.measure.stereo.project((marks.points - r) @ R)
         seen = np.isfinite(self.z) & np.isfinite(z).all(axis=1, keepdims=True)
@@ -122,7 +117,7 @@ class Linearisation:
     update: Update
     camera: Camera
     J: Array  # (12, 12): an error of the prior's camera is J times that, as an error of this one
-    change: Array  # of the state (12 + 3N,) from the prior to here, in the prior's coordinates
+    change: Array  # of the state (n,) from the prior to here, in the prior's coordinates; none of the last poses
     z: Array  # what is predicted here (M, 3) [px], NaN behind a camera
     seen: BoolArray  # components (M, 3) that are measured, of landmarks before both cameras
     own: Array  # derivatives (M, 3, 3) of what is predicted by each landmark's coordinates, zero for others
@@ -150,7 +145,7 @@ class Linearisation:
     def nu(self) -> Array:
         """Innovation (3M,) of the prior's mean: ``ν = z − h(x) + H x`` with the change x from the prior to here."""
         left = np.where(self.seen, self.update.z - self.z, 0.0).reshape(-1)
-        return np.asarray(left + self.H_times(self.change[self.update.measured, None])[:, 0])
+        return np.asarray(left + self.H_times(self.change[self.update.numbers, None])[:, 0])
 
     @cached_property
     def HP(self) -> Array:
@@ -164,39 +159,64 @@ class Linearisation:
         S[np.diag_indices(len(S))] += self.update.sigma**2
         return S
 
-    def solved(self, used: BoolArray) -> Solution:
-        """The update by some landmarks (mask (M,)). Raises LinAlgError if their S is not positive definite."""
-        rows = np.flatnonzero(np.repeat(used, 3))
-        upper, info = dpotrf(self.S[rows[:, None], rows].T)  # of the transpose, which is in the order that LAPACK wants
+    @cached_property
+    def L_inverse(self) -> Array:
+        """Of ``S = L Lᵀ`` (3M, 3M), lower triangular. Raises LinAlgError if S is not positive definite."""
+        upper, info = dpotrf(self.S.T)  # of the transpose, which is in the order that LAPACK wants
         if info != 0:
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
-        return Solution(self, used, rows, upper_inverse(upper).T)
+        return np.asarray(upper_inverse(upper).T)
+
+    @cached_property
+    def information(self) -> Array:
+        """Blocks (M, 3, 3) on the diagonal of ``S⁻¹``."""
+        columns = self.L_inverse.reshape(len(self.L_inverse), len(self.z), 3).transpose(1, 2, 0)
+        return np.asarray(columns @ columns.transpose(0, 2, 1))
+
+    def solved(self, used: BoolArray) -> Solution:
+        """The update by some landmarks (mask (M,)). Raises LinAlgError if S is not positive definite."""
+        out = np.flatnonzero(np.repeat(~used, 3))
+        Q = self.L_inverse.T @ self.L_inverse[:, out]
+        root_inverse = np.linalg.inv(np.linalg.cholesky(Q[out]))
+        return Solution(self, used, out, root_inverse, Q @ root_inverse.T)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The update by K landmarks, linearised somewhere; of them alone are ν, H, and ``S = L Lᵀ`` here."""
+    """The update by some of the landmarks, linearised somewhere.
+
+    One factor of S serves any choice of them. With ``Q = S⁻¹`` and b the rows that are left out, the inverse of the
+    others' block of S is ``Q − E Eᵀ``, with ``E = Q_:b C⁻ᵀ`` and ``Q_bb = C Cᵀ``; in the rows b that is zero.
+    """
 
     at: Linearisation
     used: BoolArray  # which landmarks (M,)
-    rows: IndexArray  # their rows (3K,) of the innovation
-    L_inverse: Array  # (3K, 3K), lower triangular
+    out: IndexArray  # rows b (B,) of the innovation, of the others
+    root_inverse: Array  # C⁻¹ (B, B)
+    E: Array  # (3M, B)
     linear: bool = True  # whether the measurements are so at the solution; not looked at where one linearisation is all
 
-    @cached_property
-    def w(self) -> Array:
-        """The whitened innovation ``L⁻¹ ν`` (3K,); its square is the NIS ``νᵀ S⁻¹ ν``."""
-        return np.asarray(self.L_inverse @ self.at.nu[self.rows])
+    def weighted(self, X: Array) -> Array:
+        """``S⁻¹ X`` of some columns (3M, ...) by what is used alone; zero in the rows of what is not."""
+        L_inverse = self.at.L_inverse
+        Y = L_inverse.T @ (L_inverse @ X) - self.E @ (self.E.T @ X)
+        Y[self.out] = 0.0
+        return np.asarray(Y)
 
     @cached_property
     def y(self) -> Array:
-        """``S⁻¹ ν`` (3K,)."""
-        return np.asarray(self.w @ self.L_inverse)
+        """``S⁻¹ ν`` (3M,)."""
+        return self.weighted(self.at.nu)
+
+    @property
+    def nis(self) -> float:
+        """``νᵀ S⁻¹ ν``."""
+        return float(self.at.nu @ self.y)
 
     @cached_property
     def change(self) -> Array:
-        """Of the state (12 + 3N,) from the prior, in the prior's coordinates: ``K ν = P Hᵀ y``."""
-        return np.delete(self.y @ self.at.HP[self.rows], np.s_[CAMERA:HEAD])
+        """Of the state (n,) from the prior, in its coordinates: ``K ν = P Hᵀ y``; the last poses do not count."""
+        return np.asarray(self.y @ self.at.HP)
 
     @cached_property
     def camera(self) -> Camera:
@@ -204,27 +224,41 @@ class Solution:
         return self.at.camera.moved(self.at.J @ (self.change - self.at.change)[:CAMERA])
 
     @cached_property
-    def by_pose(self) -> Array:
-        """Covariance (3K, 6) of w with the pose."""
-        return np.asarray(self.L_inverse @ self.at.HP[self.rows, :POSE])
+    def pose_covariance(self) -> Array:
+        """Of the error [r, φ] (6, 6) after the update, in the prior's coordinates."""
+        HP = self.at.HP[:, :POSE]
+        return np.asarray(self.at.update.covariance.pose - HP.T @ self.weighted(HP))
 
-    def gain_root(self) -> tuple[Array, Array]:
-        """V (n, 3K) with ``V Vᵀ = K S Kᵀ``, and L⁻¹ times derivatives (3K, m) of ν by errors of the rig."""
+    def gain(self) -> tuple[Array, Array, Array]:
+        """V (n, 3M) and U (n, B) with ``V Vᵀ − U Uᵀ = K S Kᵀ``; and what errors of the rig change in the gain's errors.
+
+        The last (n, m) is ``K (H x − F)`` with the derivatives x of the errors by those of the rig, and its field F.
+        """
         at, update = self.at, self.at.update
-        V = dtrmm(1.0, self.L_inverse.T, at.HP[self.rows].T, side=1, overwrite_b=1)
+        V = dtrmm(1.0, at.L_inverse.T, at.HP.T, side=1)
         by_rig = at.H_times(update.covariance.by_rig[update.numbers])
         by_rig -= np.where(at.seen[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
-        return V, self.L_inverse @ by_rig[self.rows]
+        return V, at.HP.T @ self.E, at.HP.T @ self.weighted(by_rig)
 
+    @cached_property
     def distances(self) -> Array:
-        """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any.
+        """Squared distance (M,) of each landmark's measurement from what all others that are used predict.
 
-        For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off
-        by ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so that the distance is ``y_jᵀ Q_j⁻¹ y_j``.
+        With ``y_j`` and ``Q_j`` in the rows j of a landmark that is used, its innovation is off by ``Q_j⁻¹ y_j``, with
+        covariance ``Q_j⁻¹``: the distance is ``y_jᵀ Q_j⁻¹ y_j``. Those that are not used are off by ``C⁻ᵀ Eᵀ ν``, with
+        covariance ``Q_bb⁻¹ = C⁻ᵀ C⁻¹``. A landmark that is not seen has distance 0.
         """
-        columns = self.L_inverse.reshape(len(self.rows), len(self.rows) // 3, 3).transpose(1, 2, 0)
-        found = np.zeros(len(self.used))
-        found[self.used] = squared_distances(self.y.reshape(-1, 3), columns @ columns.transpose(0, 2, 1))
+        E, root = self.E.reshape(len(self.used), 3, len(self.out)), self.root_inverse
+        off, blocks = self.y.reshape(-1, 3).copy(), self.at.information - E @ E.transpose(0, 2, 1)
+        off[~self.used] = (self.at.nu @ self.E @ root).reshape(-1, 3)
+        blocks[~self.used] = diagonal_blocks(root.T @ root)
+        found = squared_distances(off, blocks)
         if not np.isfinite(found).all():
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
         return found
+
+
+def diagonal_blocks(A: Array) -> Array:
+    """Blocks (M, 3, 3) on the diagonal of A (3M, 3M)."""
+    each = np.arange(len(A) // 3)
+    return np.asarray(A.reshape(len(each), 3, len(each), 3)[each, :, each])

@@ -101,16 +101,14 @@ class FilterLandmarks(LandmarkRows):
     c: Array  # coordinates (N, 3)
     points: Array  # positions (N, 3) [m] in the world, which follow from the two
     gauge: Array  # derivatives (N, 3, 6) of the coordinates by one of the world [shift, turn about its origin]
-    turned: Array  # largest angle (N,) between the lines of sight at first and since [rad]; π if known from elsewhere
+    sights: Array  # lines of sight (N, 3) up to which the slide is counted, in the world; NaN where that is not known
 
     @classmethod
-    def at(
-        cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array, turned: float = 0.0
-    ) -> FilterLandmarks:
-        """New ones at positions (M, 3)."""
+    def at(cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array) -> FilterLandmarks:
+        """New ones at positions (M, 3), seen from their anchors."""
         c = coordinates.of(anchors, points)
-        gauge = gauge_jacobian(coordinates, anchors, c, points)
-        return cls(ids, anchors, c, points, gauge, np.full(len(ids), turned))
+        gauge, sights = gauge_jacobian(coordinates, anchors, c, points), points - anchors[:, :, 3]
+        return cls(ids, anchors, c, points, gauge, sights / np.linalg.norm(sights, axis=1, keepdims=True))
 
     @classmethod
     def none(cls) -> FilterLandmarks:

@@ -148,7 +148,8 @@ class EulerCamera:
 
     def facing(self, T: Array) -> tuple[EulerCamera, Array]:
         """See `Camera`."""
-        return self.reanchored(T) if abs(math.sin(self.at(T).x[4])) > math.sin(LIMIT) else (self, np.eye(CAMERA))
+        sine = self.R_world_angles[:, 2] @ T[:3, 0]  # −sin φy
+        return self.reanchored(T) if abs(sine) > math.sin(LIMIT) else (self, np.eye(CAMERA))
 
     def reanchored(self, T: Array) -> tuple[EulerCamera, Array]:
         """In a new angles' world, chosen for its attitude; and the Jacobian (12, 12) of its numbers by the old.

@@ -2,22 +2,35 @@
 
 In the papers' order: the innovation (`backends.ekf.innovation`), the gate, the gain ``K = P Hᵀ S⁻¹``, the corrected
 state ``x + K ν`` and its covariance ``P − K S Kᵀ`` (paper A, Eq. 11). What is kept is ``y = S⁻¹ ν``: the state changes
-by ``P Hᵀ y``.
+by ``P Hᵀ y``. From the outside in:
+
+- `agreement` tries the prior, then the caller's guess, then (`_restarted`) a pose on which the landmarks agree. If most
+  observations contradict the prediction, it is the prediction that is wrong: by more than its linearisation holds for,
+  or, after an impulse that the motion model does not expect, a gap, or a stretch with hardly anything to see, by more
+  than it can be. Then the camera restarts where the landmarks see it, in the same map.
+- `_agreed` refuses what so few wrong observations as pass the gate may agree on by chance.
+- `solve` updates by what the `gate` lets through, and takes in what the solution predicts after all.
+- `_agreeing` takes out what the other measurements contradict; `_iterate` linearises until that is good enough.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg.lapack import dpotrf
 
-from backends.ekf.covariance import CAMERA, POSE
-from backends.ekf.innovation import Linearisation, Solution, Update
+from backends.ekf.camera import diagonal
+from backends.ekf.covariance import CAMERA, HEAD, POSE
+from backends.ekf.innovation import Linearisation, Solution, Update, diagonal_blocks
 from slam.data import BoolArray
+from slam.geometry import se3
 from slam.geometry.se3 import Array
-from slam.window.gating import squared_distances
+from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, by_chance, squared_distances
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
 #: further than needed does harm: it moves points to where noisy pixels want them, and claims information that is not
@@ -25,6 +38,9 @@ from slam.window.gating import squared_distances
 _LINEAR = 1.0
 #: Their errors together may move the pose by this share of its deviations: with a wide prior all have the same sign.
 _POSE_SHARE = 0.25
+
+#: The pose (4, 4) on which landmarks agree, if there is one.
+Search = Callable[[], "Array | None"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +53,60 @@ class Gated:
     at: Linearisation  # where they are from
 
 
+def agreement(update: Update, guess: Array | None, search: Search) -> Solution | None:
+    """Solve with the prior, or where it fails the pose, that most observations agree with; None where there is none.
+
+    It is linearised at the prior, then at the guess, a pose (4, 4), if there is one. Where less than a third of the
+    observations agrees, and as many wrong ones might agree by chance, that agreement is ignored: it could move the pose
+    anywhere. An agreement of a minority counts only if nothing else is found; of two, the larger. `search` is only
+    called where nothing else helps. Raises LinAlgError where the reason is numerical.
+    """
+    if not (np.isfinite(update.camera.pose).all() and math.isfinite(update.covariance.P.trace())):
+        raise LinAlgError("the predicted state is not finite")
+    minorities, error, majority = [], None, (len(update.z) + 1) // 2
+    for T in (None,) if guess is None else (None, guess):
+        try:
+            agreed = _agreed(gate(update, T))
+        except LinAlgError as reason:  # another start may do
+            error = reason
+            continue
+        if agreed is not None and agreed.used.sum() >= majority:
+            return agreed
+        minorities += [] if agreed is None else [agreed]
+    found = _restarted(update, search, max(MIN_CONSENSUS, majority))
+    if found is None and not minorities and error is not None:
+        raise error
+    return found or max(minorities, key=lambda one: one.used.sum(), default=None)
+
+
+def _restarted(update: Update, search: Search, least: int) -> Solution | None:
+    """At the pose on which landmarks agree, if at least so many do."""
+    T = search() if len(update.z) >= least else None
+    if T is None:
+        return None
+    models, before = update.measure.models, update.camera.pose
+    far, turned = np.linalg.norm(T[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ T[:3, :3])
+    sigmas = far, turned, models.initial_velocity_sigma, models.initial_angular_velocity_sigma
+    there = update.facing(T)
+    noise = there.camera.of_body(diagonal(sigmas))
+    there = replace(there, covariance=there.covariance.camera_moved(np.eye(CAMERA), noise))
+    with suppress(LinAlgError):
+        found = solve(gate(there, T))
+        return found if found is not None and found.used.sum() >= least else None
+    return None
+
+
+def _agreed(gated: Gated) -> Solution | None:
+    """What agrees with a prediction, if it is more than might agree by chance at the gate's own level."""
+    found = solve(gated)
+    agreed = np.zeros_like(gated.used) if found is None else found.used
+    if len(agreed) < MIN_OBSERVATIONS or ONE_AGREES_IN * agreed.sum() >= len(agreed):
+        return found
+    update = gated.at.update
+    chance = by_chance(update.z, agreed, gated.distances, update.measure.models.gate_probability)
+    return None if chance else found
+
+
 def gate(update: Update, T: Array | None = None) -> Gated:
     """Test each landmark by itself, with its innovation linearised at the prior, or with the camera at a pose T (4, 4).
 
@@ -44,7 +114,7 @@ def gate(update: Update, T: Array | None = None) -> Gated:
     """
     at = update.linearised(None if T is None else update.camera.at(T))
     limits = update.measure.limits(update.z)
-    own = squared_distances(at.nu.reshape(-1, 3), _blocks(at.S))
+    own = squared_distances(at.nu.reshape(-1, 3), diagonal_blocks(at.S))
     if not np.isfinite(own).all():
         raise LinAlgError("the predicted innovations are not finite or not positive definite")
     distances = np.where(np.isfinite(at.z).all(axis=1), own, np.nan)
@@ -62,10 +132,8 @@ def solve(gated: Gated) -> Solution | None:
         faced = update.facing(found.camera.pose)
         if faced is not update:  # the coordinates of its error are nearly singular there
             found, update = _with_readmitted(gate(faced, found.camera.pose)), faced
-    if found is not None:
-        root = found.by_pose
-        if dpotrf(update.covariance.pose - root.T @ root, lower=1)[1] != 0:
-            raise LinAlgError("the pose's covariance would not stay positive definite")
+    if found is not None and dpotrf(found.pose_covariance, lower=1)[1] != 0:
+        raise LinAlgError("the pose's covariance would not stay positive definite")
     return found
 
 
@@ -73,7 +141,8 @@ def _with_readmitted(gated: Gated) -> Solution | None:
     """With what passed the gate, and again where the solution predicts more."""
     found = _agreeing(gated, gated.used)
     if found is not None:
-        more = _predicted(found, gated)
+        there = found.at.seen.any(axis=1) & np.isfinite(gated.distances)
+        more = ~found.used & there & (found.distances <= gated.limits)
         found = (_agreeing(gated, found.used | more) or found) if more.any() else found
     return found
 
@@ -87,35 +156,12 @@ def _agreeing(gated: Gated, used: BoolArray) -> Solution | None:
     while used.any():
         found = _iterate(gated.at, used)
         used = found.used
-        excess = found.distances() / gated.limits
+        excess = np.where(used, found.distances / gated.limits, 0.0)
         worst = excess.max()
         if worst <= 1:
             return found if used.any() else None
         used = used & (excess <= max(1.0, 0.5 * worst))
     return None
-
-
-def _predicted(found: Solution, gated: Gated) -> BoolArray:
-    """Which landmarks (mask (M,)) that a solution does not use lie within the gate of what it predicts of them.
-
-    The gate tested them at the prior. With X the covariance of w with such a landmark's innovation ν, that given the
-    used ones is ``ν − Xᵀ w``, and its covariance ``S − Xᵀ X``.
-    """
-    at, agree = found.at, np.zeros(len(found.used), bool)
-    out = np.flatnonzero(~found.used & at.seen.any(axis=1) & np.isfinite(gated.distances))
-    if len(out):
-        numbers = (3 * out[:, None] + np.arange(3)).ravel()
-        X = found.L_inverse @ at.S[found.rows[:, None], numbers]
-        S = at.S[numbers[:, None], numbers] - X.T @ X
-        residuals = (at.nu[numbers] - found.w @ X).reshape(-1, 3)
-        agree[out] = squared_distances(residuals, _blocks(S)) <= gated.limits[out]
-    return agree
-
-
-def _blocks(S: Array) -> Array:
-    """Blocks (M, 3, 3) on the diagonal of S (3M, 3M)."""
-    each = np.arange(len(S) // 3)
-    return np.asarray(S.reshape(len(each), 3, len(each), 3)[each, :, each])
 
 
 def _iterate(at: Linearisation, used: BoolArray) -> Solution:
@@ -129,7 +175,7 @@ def _iterate(at: Linearisation, used: BoolArray) -> Solution:
     update, found = at.update, None
     for _ in range(update.iterations):
         if found is not None:
-            at = update.linearised(found.camera, found.change[CAMERA:])
+            at = update.linearised(found.camera, found.change[HEAD:])
         used = used & at.seen.any(axis=1)
         found = at.solved(used)
         if not np.isfinite(found.change).all() or np.abs((found.change - at.change)[3:6]).max() > np.pi:
@@ -143,12 +189,11 @@ def _iterate(at: Linearisation, used: BoolArray) -> Solution:
 def _linear(found: Solution) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
     now, update = found.at, found.at.update
-    step = (found.change - now.change)[update.measured]
+    step = (found.change - now.change)[update.numbers]
     seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
     errors = update.predicted(found.camera, found.change) - now.z - (now.own @ seen[:, :, None])[:, :, 0]
     errors = np.where(now.seen & found.used[:, None], errors, 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
-    shift = (found.L_inverse @ errors.reshape(-1)[found.rows]) @ found.by_pose
-    variances = update.covariance.pose.diagonal() - (found.by_pose**2).sum(axis=0)
-    return bool((shift**2 <= _POSE_SHARE**2 * variances).all())
+    shift = found.weighted(errors.reshape(-1)) @ now.HP[:, :POSE]
+    return bool((shift**2 <= _POSE_SHARE**2 * found.pose_covariance.diagonal()).all())

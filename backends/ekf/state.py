@@ -8,7 +8,7 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from backends.ekf.camera import Camera, Motion
-from backends.ekf.covariance import CAMERA, HEAD, Covariance
+from backends.ekf.covariance import HEAD, Covariance
 from backends.ekf.innovation import Solution
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.data import IdArray, IndexArray
@@ -21,7 +21,7 @@ class FilterState:
 
     stamp: float  # time [s]; NaN before the first prediction
     frame: int  # number of the prediction, −1 before the first
-    closed: bool  # whether the pose may not be updated any more
+    measured: bool  # whether the pose may not be updated any more
     camera: Camera
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of everything
@@ -44,36 +44,31 @@ class FilterState:
         P = J @ self.covariance.pose @ J.T
         return np.asarray(0.5 * (P + P.T))
 
-    def advanced(self, stamp: float, motion: Motion) -> FilterState:
-        """At a later time, after a motion of the camera."""
-        camera, J, noise = motion
-        covariance = self.covariance.camera_moved(J, noise, self.camera.by_error())
-        return replace(
-            self, stamp=stamp, frame=self.frame + 1, closed=False, camera=camera, covariance=covariance
-        )  # fmt: skip
-
-    def slid(self, coordinates: Coordinates, rows: IndexArray, density: float) -> FilterState:
-        """With the slide of some landmarks' features (rows (M,)), seen now from farther round than ever before.
+    def advanced(
+        self, stamp: float, motion: Motion, rows: IndexArray, density: float, unknown: float = 0.0, least: float = 0.0
+    ) -> FilterState:
+        """At a later time, after a motion of the camera, which sees the landmarks of some rows (M,) then.
 
         A feature is found where the image looks like it; from another viewpoint that is another point of the surface. A
-        landmark's direction walks at random with the angle between its lines of sight, by `density` [rad / √rad].
+        landmark's direction walks at random with the angle between its lines of sight, by `density` [rad / √rad]; where
+        the earlier one is not known, as of a prior map, by as much as with an angle `unknown` [rad]. Angles of less
+        than `least` [rad] wait: a camera that stands seems to turn to and fro.
         """
-        if not density:
-            return self
-        marks, at = self.landmarks.select(rows), self.pose[:3, 3]
-        first, now = marks.points - marks.anchors[:, :, 3], marks.points - at
-        distance = np.linalg.norm(now, axis=1)
-        cosine = np.einsum("ni,ni->n", first, now) / (np.linalg.norm(first, axis=1) * distance)
-        turned = np.maximum(marks.turned, np.arccos(np.clip(cosine, -1.0, 1.0)))
-        more = turned - marks.turned
-        if not (more > 0).any():
-            return self
-        n = now / distance[:, None]
-        across = (density**2 * more * distance**2)[:, None, None] * (np.eye(3) - n[:, :, None] * n[:, None, :])
-        D, angles = coordinates.inverse_jacobian(marks.anchors, marks.c), self.landmarks.turned.copy()
-        angles[rows] = turned
-        covariance = self.covariance.widened(rows, D @ across @ D.transpose(0, 2, 1))
-        return replace(self, landmarks=replace(self.landmarks, turned=angles), covariance=covariance)
+        (camera, J, noise), landmarks, slide = motion, self.landmarks, None
+        if density:
+            sight, sights = landmarks.points[rows] - camera.pose[:3, 3], landmarks.sights.copy()
+            distance = np.linalg.norm(sight, axis=1, keepdims=True)
+            cosine = (sight / distance * sights[rows]).sum(axis=1)
+            angle = np.where(np.isnan(cosine), unknown, np.arccos(np.clip(cosine, -1.0, 1.0)))
+            some = angle > least
+            rows, sight, distance, angle = rows[some], sight[some], distance[some], angle[some]
+            across = (distance**2)[:, :, None] * np.eye(3) - sight[:, :, None] * sight[:, None, :]
+            D = landmarks.gauge[rows, :, :3]
+            slide = (density**2 * angle)[:, None, None] * (D @ across @ D.transpose(0, 2, 1))
+            sights[rows] = sight / distance
+            landmarks = replace(landmarks, sights=sights)
+        covariance = self.covariance.camera_moved(J, noise, self.camera.by_error(), rows, slide)
+        return FilterState(stamp, self.frame + 1, False, camera, landmarks, covariance)
 
     # --- landmarks join and leave ---
 
@@ -89,13 +84,13 @@ class FilterState:
             return self
         R, anchors = self.pose[:3, :3], np.repeat(self.pose[None, :3], len(h), axis=0)
         new = FilterLandmarks.at(coordinates, ids, anchors, self.pose[:3, 3] + h @ R.T)
-        D = coordinates.inverse_jacobian(anchors, new.c) @ R
+        D = new.gauge[:, :, :3] @ R
         noise = D @ covariances @ D.transpose(0, 2, 1)
         by_rig = np.zeros((len(h), 3, self.covariance.by_rig.shape[1])) if by_rig is None else D @ by_rig
         covariance = self.covariance.appended(new.gauge @ self.camera.displacement(), noise, by_rig)
         end = self.covariance.correlated
         landmarks = self.landmarks.select(slice(end)).joined(new).joined(self.landmarks.select(slice(end, None)))
-        return replace(self, closed=True, landmarks=landmarks, covariance=covariance)
+        return replace(self, measured=True, landmarks=landmarks, covariance=covariance)
 
     def inserted(self, new: FilterLandmarks, covariances: Array) -> FilterState:
         """With landmarks known from elsewhere, by covariances (M, 3, 3) of their coordinates."""
@@ -142,11 +137,11 @@ class FilterState:
         and Bonnabel, 2015). Raises LinAlgError where the new state is not finite, or a variance is lost in rounding.
         """
         update, camera = found.at.update, found.camera
-        marks = self.landmarks.moved(update.coordinates, self._parts()[0], found.change[CAMERA:].reshape(-1, 3))
+        marks = self.landmarks.moved(update.coordinates, self._parts()[0], found.change[HEAD:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise LinAlgError("the corrected state is not finite")
         J, shift = update.camera.transport(camera), self._shift(marks, camera)
-        covariance = update.covariance.corrected(*found.gain_root(), J, shift)
+        covariance = update.covariance.corrected(*found.gain(), J, shift)
         if not (covariance.P.diagonal()[HEAD:] > 0).all():
             raise LinAlgError("a landmark's variance would not stay positive")
         return replace(self, camera=camera, landmarks=marks, covariance=covariance)

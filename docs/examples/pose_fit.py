@@ -19,7 +19,7 @@ class PoseFit:
     def predict(self, stamp):
         self.stamp = stamp  # the camera stays where it is: no model of motion
         ids = np.array(sorted(self.points), np.int64)
-        local = transform(inverse(self.T), self.positions(ids))
+        local = transform(inverse(self.T), self._places(ids))
         view = self.rig.left.in_view(local)
         left, right = self.rig.project(local[view])
         innovation = np.tile(100.0 * np.eye(2), (int(view.sum()), 1, 1))  # landmarks may lie 10 px off
@@ -31,7 +31,7 @@ class PoseFit:
             return UpdateReport.nothing(UpdateStatus.EMPTY, "fewer than 3 landmarks", seen.ids[:0])
         measured = measurement_rows(seen.uv_left, seen.uv_right)
         start = self.T if guess is None else guess
-        found = find_consensus(self.rig, self.positions(seen.ids), measured, start, 4 * sigma, 64, seed=0)
+        found = find_consensus(self.rig, self._places(seen.ids), measured, start, 4 * sigma, 64, seed=0)
         self.T = found.T_world_left
         used, rejected = seen.ids[found.inliers], seen.ids[~found.inliers]
         return UpdateReport(UpdateStatus.OK, "", used, rejected, float("nan"), 0)
@@ -44,10 +44,10 @@ class PoseFit:
         for i in np.asarray(ids).tolist():
             del self.points[i]
 
-    def positions(self, ids):
+    def _places(self, ids):  # `positions`, for others, is guarded's
         return np.array([self.points[int(i)] for i in ids]).reshape(-1, 3)
 
     def estimate(self, landmarks=True):
         ids = np.array(sorted(self.points) if landmarks else [], np.int64)
         spread = np.tile(0.01 * np.eye(3), (len(ids), 1, 1))
-        return Estimate(self.stamp, self.T, self.P, ids, self.positions(ids), spread)
+        return Estimate(self.stamp, self.T, self.P, ids, self._places(ids), spread)

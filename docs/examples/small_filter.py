@@ -25,8 +25,8 @@ class SmallFilter:
         by_pose, by_points = points_by_pose(local).reshape(-1, 6), np.kron(np.eye(len(self.points))[rows], R_left_world)
         return local, np.hstack([by_pose, 0 * by_pose, by_points]).reshape(len(rows), 3, len(self.P))
 
-    def predict(self, stamp):  # an impulse changes the velocity, which then stays; the first frame moves nothing
-        dt, F = np.nan_to_num(stamp - self.stamp), np.eye(len(self.P))
+    def predict(self, stamp):  # an impulse changes the velocity, which then stays, for ten seconds at most
+        dt, F = min(np.nan_to_num(stamp - self.stamp), 10.0), np.eye(len(self.P))
         F[:6, :12] = np.hstack([adjoint(exp(-dt * self.rate)), dt * np.eye(6)])
         self.P[6:12, 6:12] += np.diag(velocity_sigmas(self.measure.models, dt, np.isnan(self.stamp)) ** 2)
         self.stamp, self.T, self.P = stamp, self.T @ exp(dt * self.rate), F @ self.P @ F.T
@@ -46,8 +46,8 @@ class SmallFilter:
         nu, H = nu[there], H[there]
         S = H @ self.P @ H.T + variance * np.eye(len(H))
         K = np.linalg.solve(S, H @ self.P).T
-        x, P = K @ nu, self.P - K @ S @ K.T
-        self.T, self.rate, self.P = self.T @ exp(x[:6]), self.rate + x[6:12], 0.5 * (P + P.T)
+        x, L = K @ nu, np.eye(len(self.P)) - K @ H  # Joseph's form stays definite, however large P was
+        self.T, self.rate, self.P = self.T @ exp(x[:6]), self.rate + x[6:12], L @ self.P @ L.T + variance * K @ K.T
         self.points = self.points + x[12:].reshape(-1, 3)
         return UpdateReport(UpdateStatus.OK, "", ids[good], ids[~good], nu @ np.linalg.solve(S, nu), len(nu))
 

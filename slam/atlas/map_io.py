@@ -33,11 +33,7 @@ from slam.version import __version__
 
 _MAGIC = "surf-stereo-slam map "
 _VERSION = 7  # fixed: of the file format
-_TEXTS = ("frontend", "world_frame", "written_by")  # of the header
 _DATE = (1980, 1, 1, 0, 0, 0)  # fixed: NumPy's for all members, so that the same map gives the same bytes
-
-#: World frame of a map that was built from scratch.
-FIRST_FRAME = "left camera at the first frame"
 
 _LARGEST = 2**31  # bytes of a file
 _MOST_DIMENSIONS, _LONGEST = 4096, 1e6  # guard: of descriptors
@@ -110,8 +106,6 @@ class SavedMap:
         seen: number of frames in which each was measured (N,).
         in_view: number of frames in which each was detected or should have been (N,).
         frontend: name of the front end that the descriptors are from; empty where it is not known.
-        world_frame: what the world's axes are, in words.
-        written_by: name and version of the program.
         seen_from: where the camera was when it saw each first (N, 3) [m] in the map's world frame; NaN where not known.
         source: where it was read from, for messages; not part of the map.
         keyframes: with the poses of the rectified left camera that the back end estimated at the time.
@@ -131,8 +125,6 @@ class SavedMap:
     seen: IdArray
     in_view: IdArray
     frontend: str = ""
-    world_frame: str = FIRST_FRAME
-    written_by: str = ""
     source: str = "the map"
     seen_from: Array = field(default=None)  # type: ignore[arg-type]
     keyframes: tuple[Keyframe, ...] = ()
@@ -164,7 +156,7 @@ class SavedMap:
         return len(self.ids)
 
     def __repr__(self) -> str:
-        return f"SavedMap({self.holds}, {self.dimensions}-D, {self.world_frame})"
+        return f"SavedMap({self.holds}, {self.dimensions}-D)"
 
     @property
     def holds(self) -> str:
@@ -192,7 +184,7 @@ class SavedMap:
 
     @classmethod
     def of(
-        cls, landmarks: LandmarkTable, estimate: Estimate, frontend: str, world_frame: str, atlas: Atlas,
+        cls, landmarks: LandmarkTable, estimate: Estimate, frontend: str, atlas: Atlas,
         rig: StereoRig,
     ) -> SavedMap:  # fmt: skip
         """The map of a running system: landmark rows, the back end's estimate, what both belong to, and keyframes."""
@@ -200,10 +192,9 @@ class SavedMap:
         P = definite(estimate.covariances)
         return cls(
             estimate.ids.astype(np.int64), estimate.positions, P, landmarks.descriptors.astype(np.float32),
-            landmarks.laplacian.astype(np.int8), landmarks.seen, landmarks.in_view, frontend, world_frame,
-            f"surf-stereo-slam {__version__}", seen_from=landmarks.seen_from,
-            keyframes=atlas.keyframes, keyframe_poses=atlas.poses_in_map, loops=atlas.loops,
-            rig=np.array([numbers[name] for name in _RIG]),
+            landmarks.laplacian.astype(np.int8), landmarks.seen, landmarks.in_view, frontend,
+            seen_from=landmarks.seen_from, keyframes=atlas.keyframes, keyframe_poses=atlas.poses_in_map,
+            loops=atlas.loops, rig=np.array([numbers[name] for name in _RIG]),
         )  # fmt: skip
 
     def require_fits(self, frontend: str, rig: StereoRig) -> None:
@@ -245,7 +236,7 @@ def load_map(path: str | Path) -> SavedMap:
 
 def encode(saved: SavedMap) -> bytes:
     """The bytes of a file; the same for the same map."""
-    header = {name: getattr(saved, name) for name in (*_TEXTS, "holds")}
+    header = {"frontend": saved.frontend, "holds": saved.holds, "written_by": f"surf-stereo-slam {__version__}"}
     archive = io.BytesIO()
     arrays: dict[str, Any] = dict(map_arrays(saved))
     np.savez(archive, **arrays)
@@ -270,9 +261,9 @@ def decode(data: bytes, source: str) -> SavedMap:
         raise SlamError(f"{source}: the map was altered or cut short: its checksum is wrong")
     members = unpack(body, source, ("header.json", *_ARRAYS))
     header = json_text(members["header.json"], f"{source}: header.json")
-    if not isinstance(header, dict) or any(not isinstance(header.get(name), str) for name in _TEXTS):
-        raise SlamError(f"{source}: header.json must give {', '.join(_TEXTS)}")
-    return map_of(members, {name: header[name] for name in _TEXTS}, source)
+    if not isinstance(header, dict) or not isinstance(header.get("frontend"), str):
+        raise SlamError(f"{source}: header.json must give the frontend")
+    return map_of(members, header["frontend"], source)
 
 
 def map_arrays(saved: SavedMap) -> dict[str, np.ndarray]:
@@ -295,8 +286,8 @@ def map_arrays(saved: SavedMap) -> dict[str, np.ndarray]:
     return arrays
 
 
-def map_of(arrays: Mapping[str, np.ndarray], texts: Mapping[str, str], source: str) -> SavedMap:
-    """The map of arrays by the names of `_ARRAYS`, and of the header's texts.
+def map_of(arrays: Mapping[str, np.ndarray], frontend: str, source: str) -> SavedMap:
+    """The map of arrays by the names of `_ARRAYS`, whose descriptors are of a front end.
 
     Raises:
         SlamError: the arrays do not fit together, or a value is impossible; `source` names them in the message.
@@ -317,5 +308,5 @@ def map_of(arrays: Mapping[str, np.ndarray], texts: Mapping[str, str], source: s
 
     keyframes = [Keyframe(-1, **fields_of(k=i, f=slice(*span))) for i, span in enumerate(pairwise(begin))]
     loops = [Loop(first, second, **fields_of(l=i)) for i, (first, second) in enumerate(pairs.tolist())]
-    whole: dict[str, Any] = {name: arrays[name] for name in (*_LANDMARKS, "keyframe_poses", "rig")} | dict(texts)
-    return SavedMap(**whole, source=source, keyframes=tuple(keyframes), loops=tuple(loops))
+    whole: dict[str, Any] = {name: arrays[name] for name in (*_LANDMARKS, "keyframe_poses", "rig")}
+    return SavedMap(**whole, frontend=frontend, source=source, keyframes=tuple(keyframes), loops=tuple(loops))

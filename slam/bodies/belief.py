@@ -9,13 +9,13 @@ world.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from slam.bodies.config import CLEAR
 from slam.data import BoolArray, IdArray, RecentPoses
-from slam.geometry.arrays import Table
+from slam.geometry.arrays import Table, changed
 from slam.geometry.se3 import Array, adjoint
 from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate
@@ -164,17 +164,17 @@ def slid(b: BodyBelief, stereo: RectifiedStereo, motion: Motion, drift: float) -
     joins, ends = here & ~member & b.alive, member & ~b.alive
     taken = (rows.pose == 0) & (member | joins)[rows.point] | ends[rows.point]
     w = window(b, stereo, motion.select(np.flatnonzero((motion.poses <= 0).any(axis=1))))
-    w = replace(w, rows=rows.select(taken), joining=np.flatnonzero(joins))
+    w = changed(w, rows=rows.select(taken), joining=np.flatnonzero(joins))
     prior, _, _ = marginalised(w, [0], ends[b.prior.points])
     prior, turned = _drifted(prior, b, drift)
     rows, keep = rows.select(~taken & (rows.pose > 0)), member & b.alive | joins
     keep[rows.point] = True
     index = np.cumsum(keep) - 1
-    return replace(
+    return changed(
         b, stamps=b.stamps[1:], poses=b.poses[1:], scales=b.scales[1:],
-        points=replace(b.points, turned=turned).select(keep),
-        rows=replace(rows, pose=rows.pose - 1, point=index[rows.point]),
-        prior=replace(prior, points=index[prior.points]), covariance=b.covariance[6:, 6:],
+        points=changed(b.points, turned=turned).select(keep),
+        rows=changed(rows, pose=rows.pose - 1, point=index[rows.point]),
+        prior=changed(prior, points=index[prior.points]), covariance=b.covariance[6:, 6:],
     )  # fmt: skip
 
 
@@ -197,6 +197,6 @@ def _drifted(prior: RelativePrior, b: BodyBelief, density: float) -> tuple[Relat
     S = np.diag(1.0 / np.repeat(density**2 * more[far], 2)) + prior.information[np.ix_(at, at)]
     gain = np.linalg.solve(S, prior.information[at]).T
     information = prior.information - gain @ prior.information[at]
-    return replace(
+    return changed(
         prior, information=0.5 * (information + information.T), vector=prior.vector - gain @ prior.vector[at]
     ), out

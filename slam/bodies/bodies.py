@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,8 @@ from slam.bodies.belief import EVEN, BodyBelief, when_measured, when_missed
 from slam.bodies.config import CLEAR, MIN_FRAMES
 from slam.bodies.track_kernels import windows_in_body
 from slam.data import BoolArray
-from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, transform
+from slam.geometry.arrays import changed
+from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, transform, twice
 from slam.models import ObjectModels
 from slam.object_data import MovingObject
 from slam.tracks.table import Tracks
@@ -102,7 +103,7 @@ class Body:
         """The body with its pose at the present frame, whose slot is `slot`, and other changes."""
         history, known = self.history.copy(), self.known.copy()
         history[slot], known[slot] = T, measured
-        return replace(self, T=T, history=history, known=known, measured=measured, **changes)
+        return changed(self, T=T, history=history, known=known, measured=measured, **changes)
 
 
 def new_body(
@@ -130,8 +131,7 @@ def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
     T[:3, :3] = so3_exp(dt * body.velocity[:3]) @ T[:3, :3]
     T[:3, 3] += dt * body.velocity[3:]
     linear, angular = models.velocity_variance(dt)
-    R = np.zeros((6, 6))
-    R[:3, :3] = R[3:, 3:] = T[:3, :3].T
+    R = twice(T[:3, :3].T)
     velocity = body.velocity_covariance + np.diag([angular] * 3 + [linear] * 3)
     return body.placed(
         T, slot, False, T_before=body.T, covariance=body.covariance + dt**2 * R @ velocity @ R.T,
@@ -150,7 +150,7 @@ def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_spe
     if estimate.measured:
         changes = {"seen_at": stamp, "measured_at": stamp, "seen": body.seen + 1, "missed": 0}
     if estimate.measured and belief.since == stamp and body.belief is None:
-        body = replace(body, known=np.zeros_like(body.known))  # the estimate began anew: it knows of no earlier pose
+        body = changed(body, known=np.zeros_like(body.known))  # the estimate began anew: it knows of no earlier pose
     return body.placed(
         estimate.T_world_object, slot, estimate.measured, covariance=estimate.covariance, velocity=v,
         velocity_covariance=P, belief=belief,
@@ -176,7 +176,7 @@ def continued(body: Body, known: Body) -> Body:
     change = inverse(body.T) @ frame
     turn = adjoint(inverse(change))
     corners = transform(inverse(change), np.stack([body.lower, body.upper]))
-    return replace(
+    return changed(
         body, id=known.id, T=frame, T_before=body.T_before @ change, history=body.history @ change,
         covariance=turn @ body.covariance @ turn.T, lower=corners.min(axis=0), upper=corners.max(axis=0),
         certain=known.certain, existence=known.existence, evidence=known.evidence, age=known.age,
@@ -201,10 +201,10 @@ def hidden(bodies: Iterable[Body], eye: Array, points: Array) -> BoolArray:
 
 def with_evidence(body: Body, gain: float, agreeing: int, against: int) -> Body:
     """The body after what this frame says of its existence, see `slam.bodies.belief`, and of what it encloses."""
-    body = replace(body, agreeing=body.agreeing + agreeing, against=body.against + against)
+    body = changed(body, agreeing=body.agreeing + agreeing, against=body.against + against)
     if body.measured:
-        return replace(body, existence=when_measured(body.existence, gain))
-    return replace(body, existence=when_missed(body.existence, body.seen, body.age))
+        return changed(body, existence=when_measured(body.existence, gain))
+    return changed(body, existence=when_missed(body.existence, body.seen, body.age))
 
 
 def with_extent(body: Body, local: Array) -> Body:
@@ -212,7 +212,7 @@ def with_extent(body: Body, local: Array) -> Body:
     if len(local) < 3:
         return body
     lower, upper = outermost(local)
-    return replace(body, lower=lower, upper=upper)
+    return changed(body, lower=lower, upper=upper)
 
 
 def outermost(points: Array) -> tuple[Array, Array]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -25,16 +24,17 @@ from slam.bodies.estimator import FRAMES, BodyEstimator
 from slam.bodies.finder import Scene, parting
 from slam.bodies.fits import fit_positions, fit_velocities, record, revise_tracks
 from slam.bodies.following import follow, found_again, located, observed
-from slam.bodies.frame import NO_IDS, Frame, OnlinePose, Setup, recent_poses
+from slam.bodies.frame import NO_IDS, Frame, Setup
 from slam.bodies.membership import merge
 from slam.bodies.proof import Way, with_frame
 from slam.bodies.regions import Region, follow_regions
 from slam.data import BoolArray, Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
-from slam.geometry.arrays import among, median
+from slam.geometry.arrays import among, changed, median
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, transform
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
+from slam.third_party import OnlinePose, derived_recent
 from slam.tracks.table import Tracks
 
 _FORGOTTEN = 8.0  # [s] after which an unseen body is forgotten
@@ -167,7 +167,9 @@ class MovingObjectDetector(ObjectDetector):
         measured = among(len(local), tracks.row[tracks.row >= 0])
         measuring = local[measured & np.isfinite(local[:, 0])]
         self._path = [*self._path[-FRAMES:], OnlinePose(s.rig, s.sigma, estimate, measuring)]
-        cameras = recent_poses(recent, self._path)
+        cameras = recent
+        if cameras is None or len(cameras) < len(self._path):  # as of a back end that has corrected its past
+            cameras = derived_recent(self._path)
         return Frame(s, self._number, features, local, self._stamps.copy(), self._poses.copy(), cameras)
 
     def _advance_bodies(self, tracks: Tracks, frame: Frame) -> None:
@@ -186,8 +188,9 @@ class MovingObjectDetector(ObjectDetector):
             body = self.bodies[body.id] = self._estimated(body, tracks, frame)
             mine = np.flatnonzero(tracks.body == body.id)
             tracks.position[mine] = transform(body.T, tracks.local[mine])
+        unfound = np.flatnonzero((tracks.number >= 0) & (tracks.row < 0))
         for column in (tracks.A, tracks.p, tracks.dof):  # what the slot held leaves the window
-            column[:, frame.slot] = 0
+            column[unfound, frame.slot] = 0
         record(tracks, np.flatnonzero(tracks.found), frame)
 
     def _estimated(self, body: Body, tracks: Tracks, frame: Frame) -> Body:
@@ -201,7 +204,7 @@ class MovingObjectDetector(ObjectDetector):
         tracks.row[mine[hidden(front, frame.eye, tracks.position[mine])]] = -1
         belief = located(body, tracks, frame, self._estimator)
         if belief is None or not self.setup.models.known(belief.estimate):  # it begins anew once it is found again
-            return replace(body, belief=None)
+            return changed(body, belief=None)
         return with_belief(body, belief, slot, stamp, self.setup.config.min_speed)
 
     def _fit(self, tracks: Tracks, frame: Frame) -> None:
@@ -236,7 +239,7 @@ class MovingObjectDetector(ObjectDetector):
         farther than they are wide already.
         """
         members = group.members
-        body = replace(group.body(self._next_body, frame, tracks), far=far)
+        body = changed(group.body(self._next_body, frame, tracks), far=far)
         parts = {id: b for id, b in self.bodies.items() if whole is None or b.apart_from == whole}
         known = membership.reappeared(parts, body, self.setup.config.max_speed)
         if known is not None:
@@ -244,7 +247,7 @@ class MovingObjectDetector(ObjectDetector):
             body = continued(body, known)
         self._next_body = max(self._next_body, body.id + 1)
         membership.add_members(body, tracks, members, sure=True)
-        self.bodies[body.id] = with_extent(replace(body, apart_from=whole), tracks.local[members])
+        self.bodies[body.id] = with_extent(changed(body, apart_from=whole), tracks.local[members])
 
     def _prove(self, tracks: Tracks, frame: Frame, scenes: Mapping[int | None, Scene]) -> None:
         """Weigh what says that bodies move; those that do not for long, given how long they did, are dropped."""
@@ -259,7 +262,7 @@ class MovingObjectDetector(ObjectDetector):
             moved, way = finder.moved_in(whole, tracks, members, frame), Way.of(body, frame, whole)
             far = body.far or (self.setup.config.size > 0 and body.went > body.across)
             evidence, counts = with_frame(body.evidence, moved, scene, way, far, both)
-            body = replace(body, evidence=evidence, certain=body.certain + counts, far=far)
+            body = changed(body, evidence=evidence, certain=body.certain + counts, far=far)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= 2 * WINDOW:  # the first holds how it started
                 self._drop(tracks, body)
@@ -278,7 +281,7 @@ class MovingObjectDetector(ObjectDetector):
                 mine = np.flatnonzero((tracks.body == id) & tracks.found)
                 seen = observed(body, tracks, mine, frame.features)
                 belief = self._estimator.updated(None, id, seen, frame.cameras)
-                self.bodies[id] = replace(body, belief=belief, measured_at=frame.features.stamp)
+                self.bodies[id] = changed(body, belief=belief, measured_at=frame.features.stamp)
 
     def _begin_tracks(self, tracks: Tracks, frame: Frame) -> None:
         """Follow landmarks and stereo features that are not followed yet; give up what was not found for long."""

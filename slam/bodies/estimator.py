@@ -9,7 +9,7 @@ body that is seen for long does not drift. The camera's estimate is read and nev
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,9 +17,9 @@ from slam.bodies.belief import BodyBelief, Points, begun, carried, compact, slid
 from slam.bodies.config import MIN_POINTS, RUN
 from slam.chi_square import chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, Observations, RecentPoses
-from slam.geometry.arrays import isin
+from slam.geometry.arrays import changed, isin
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig
-from slam.geometry.se3 import Array, adjoint, inverse, log, pose, so3_exp, so3_left_jacobian, so3_log, transform
+from slam.geometry.se3 import Array, adjoint, inverse, log, pose, so3_exp, so3_left_jacobian, so3_log, transform, twice
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.window import pose_only
@@ -137,12 +137,12 @@ class BodyEstimator:
         T, velocity = cameras.poses[-2] @ inverse(b.poses[-1]), b.estimate.velocity
         T = pose(so3_exp(dt * velocity[:3]) @ T[:3, :3], T[:3, 3] + dt * velocity[3:])
         Y = inverse(T) @ cameras.poses[-1]
-        b = replace(
+        b = changed(
             b, stamps=cameras.stamps, poses=np.concatenate([b.poses, Y[None]]), scales=np.append(b.scales, 1.0),
-            points=replace(b.points, unseen=b.points.unseen + 1),
+            points=changed(b.points, unseen=b.points.unseen + 1),
         )  # fmt: skip
         by_step = adjoint(inverse(Y)) * dt
-        back = np.kron(np.eye(2), T[:3, :3].T)
+        back = twice(T[:3, :3].T)
         impulses = by_step * np.sqrt(np.repeat(self.models.velocity_variance(dt)[::-1], 3))
         covariance = by_step @ back @ b.estimate.velocity_covariance @ back.T @ by_step.T
         turn = Y[:3, :3].T @ b.poses[-2][:3, :3]
@@ -156,7 +156,7 @@ class BodyEstimator:
         e = linearised(window(b, self.stereo, carried(b, cameras, self.models)))
         solution = Solution(e.window, e, np.linalg.cholesky(e.H), e.cost)
         local, _ = solution.point_covariances(len(b) - 1)
-        return replace(b, covariance=solution.pose_covariance, points=replace(b.points, local=local))
+        return changed(b, covariance=solution.pose_covariance, points=changed(b.points, local=local))
 
     def _solved(
         self, expected: _Expected, seen: _Seen, cameras: RecentPoses
@@ -170,7 +170,7 @@ class BodyEstimator:
         if not len(rows):
             return None, ids, ids
         Y, used, scale = self._agreement(expected, rows, z)
-        b = replace(
+        b = changed(
             b, poses=np.concatenate([b.poses[:-1], Y[None]]), scales=np.append(b.scales[:-1], scale)
         )  # fmt: skip
         motion = carried(b, cameras, self.models)
@@ -179,7 +179,7 @@ class BodyEstimator:
         for again in range(_SOLVED_AGAIN + 1):
             if used.sum() < enough:
                 return None, ids[:0], ids
-            tried = replace(b, rows=b.rows.joined(Rows.of(len(b) - 1, rows[used], z[used], self.sigma)))
+            tried = changed(b, rows=b.rows.joined(Rows.of(len(b) - 1, rows[used], z[used], self.sigma)))
             solution = solve(window(tried, self.stereo, motion))
             local, _ = solution.point_covariances(len(b) - 1)
             distances = solution.left_out_distances(-1, rows[used], z[used], local[rows[used]], self.sigma)
@@ -218,9 +218,9 @@ class BodyEstimator:
         unseen[rows] = 0
         ids[failures >= RUN] = -1
         w = solution.window
-        return replace(
+        return changed(
             b, poses=w.poses, covariance=solution.pose_covariance,
-            points=replace(p, ids=ids, position=w.points, local=local, failures=failures, unseen=unseen),
+            points=changed(p, ids=ids, position=w.points, local=local, failures=failures, unseen=unseen),
         )  # fmt: skip
 
     def _joined(self, b: BodyBelief, seen: _Seen, new: BoolArray) -> tuple[BodyBelief, IndexArray]:
@@ -239,8 +239,8 @@ class BodyEstimator:
         own = self.stereo.rig.triangulation_covariance(h, self.sigma)
         new_points = Points.new(seen.given.points[which], transform(b.poses[-1], h), own, b.poses[-1][:3, 3])
         at = len(ids) + np.arange(len(which))
-        points = replace(b.points, ids=ids).joined(new_points)
-        return replace(
+        points = changed(b.points, ids=ids).joined(new_points)
+        return changed(
             b, points=points, rows=b.rows.joined(Rows.of(len(b) - 1, at, seen.z[which], self.sigma))
         ), which  # fmt: skip
 
@@ -264,7 +264,7 @@ class BodyEstimator:
         )  # fmt: skip
         if not all(np.isfinite(a).all() for a in (estimate.T_world_object, estimate.covariance, velocity, spread)):
             raise np.linalg.LinAlgError("a body's estimate is not finite")
-        return replace(b, estimate=estimate)
+        return changed(b, estimate=estimate)
 
 
 def _of(cameras: RecentPoses, stamps: Array) -> RecentPoses:

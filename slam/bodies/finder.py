@@ -64,11 +64,20 @@ class Group:
 
     members: IndexArray  # their rows (K,)
     test: float  # χ²(6) of their motion against the rest's
-    away: float  # how far they went against the rest, in the mean [m]
+    moved: Displacements  # of all tracks
+    common: Array  # the rest's motion ξ (6,)
+
+    @property
+    def away(self) -> float:
+        """How far its tracks went against the rest, in the weighted mean [m]."""
+        m, rows, c = self.moved, self.members, self.common
+        W = m.W[rows]
+        gap = m.d[rows] - m.lag[rows, None] * (m.points[rows] @ hat(c[:3]).T + c[3:])
+        return float(np.linalg.norm(np.linalg.solve(W.sum(axis=0), times_vectors(W, gap).sum(axis=0))))
 
     def moves(self, test: float, away: float) -> bool:
-        """Whether it went farther than `away` [m] and moved for certain: by a χ²(6) above `limit` of `test`."""
-        return bool(self.away > away and self.test > limit(test, len(self.members)))
+        """Whether it moved for certain, by a χ²(6) above `limit` of `test`, and went farther than `away` [m]."""
+        return bool(self.test > limit(test, len(self.members)) and self.away > away)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,30 +139,18 @@ def classify_scene(moved: Displacements, place: Array, test: float) -> Scene:
     n = len(moved.d)
     if n < 3 * MIN_POINTS:
         return Scene([], np.zeros(n), np.zeros(6), np.diag(1.0 / kernels.PRIOR))
-    L, eta, dWd = kernels.normal_equations(moved.points, moved.d, moved.W, moved.lag)
+    sums = kernels.normal_equations(moved.points, moved.d, moved.W, moved.lag)
     asked = limit(test, np.arange(n + 1, dtype=np.intp))
-    codes = np.sort(kernels.window_codes(place, _SIZES))
-    windows = kernels.full_windows(codes, n, _SIZES, MIN_POINTS)
-    group, values, alone, common, scale = kernels.groups_apart(L, eta, dWd, place, *windows, asked, MIN_POINTS)
-    rest = group < 0
-    heavier = tail(alone[rest])  # of what is in no group: before, other groups would be part of it
-    found = [(np.flatnonzero(group == k), value / heavier) for k, value in enumerate(values.tolist())]
+    codes = np.sort(kernels.window_codes(place, _SIZES), axis=1)
+    group, values, alone, common, information, scale = kernels.groups_apart(
+        sums, place, codes, _SIZES, asked, MIN_POINTS
+    )
+    heavier = tail(alone[group < 0])  # of what is in no group: before, other groups would be part of it
     groups = [
-        Group(members, value, _mean_gap(moved, members, common))
-        for members, value in found
-        if value > limit(test, len(members))
+        Group(np.flatnonzero(group == k), value / heavier, moved, common) for k, value in enumerate(values.tolist())
     ]
-    information = np.zeros((6, 6))
-    information[np.tril_indices(6)] = L[rest].sum(axis=0)
-    information += np.tril(information, -1).T + np.diag(kernels.PRIOR)
+    groups = [group for group in groups if group.test > limit(test, len(group.members))]
     return Scene(groups, alone, common, scale * heavier * np.linalg.inv(information))
-
-
-def _mean_gap(moved: Displacements, rows: IndexArray, common: Array) -> float:
-    """How far tracks went against a common motion, in the weighted mean [m]."""
-    W = moved.W[rows]
-    gap = moved.d[rows] - moved.lag[rows, None] * (moved.points[rows] @ hat(common[:3]).T + common[3:])
-    return float(np.linalg.norm(np.linalg.solve(W.sum(axis=0), times_vectors(W, gap).sum(axis=0))))
 
 
 def tail(alone: Array) -> float:

@@ -12,7 +12,7 @@ from slam.bodies.bodies import Body, of_bodies
 from slam.bodies.config import MIN_FRAMES, MIN_POINTS
 from slam.bodies.estimator import BodyEstimator
 from slam.bodies.frame import Frame
-from slam.bodies.track_kernels import inverses
+from slam.bodies.track_kernels import expected_pixels, inverses
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among, isin
@@ -74,17 +74,14 @@ def _look(tracks: Tracks, frame: Frame, rows: IndexArray, taken: BoolArray) -> N
     if not len(rows):
         return
     s, c, f, T = frame.setup, frame.setup.config, frame.features, frame.T_world_left
-    places = tracks.position[rows]
-    z, J = s.rig.project_stereo(transform(inverse(T), places))
-    G = J @ T[:3, :3].T
-    S = G @ tracks.covariance[rows] @ np.swapaxes(G, 1, 2) + s.sigma**2 * np.eye(3)
+    z, S = expected_pixels(s.rig.rectified_parameters, T, tracks.position, tracks.covariance, rows, s.sigma)
     least = np.where(tracks.doubtful[rows], 0.5 * _SEARCH[1], _SEARCH[0])
     windows = features_of_tracks.Windows((SIGMAS,), (_ALIKE[0],), _ALIKE[1], _SEARCH[1], least)
     looks = tracks.look[rows], tracks.laplacian[rows]
     found = features_of_tracks.follow(z[:, :2], S[:, :2, :2], *looks, f, windows, taken)
     m, row = found.tracks, found.features
     # A right pixel off by more says that this is another point, or a false stereo match.
-    depth = np.maximum((places[m] - T[:3, 3]) @ T[:3, 2], 1e-3)
+    depth = np.maximum((tracks.position[rows[m]] - T[:3, 3]) @ T[:3, 2], 1e-3)
     uneven = np.where(tracks.count(rows[m]) < MIN_FRAMES, 1.0, _UNEVEN)
     deviation = np.sqrt(np.maximum(S[m, 2, 2], s.sigma**2))  # rounding may leave a covariance that is not definite
     allowance = _RIGHT_SIGMAS * deviation + uneven * c.max_speed * frame.dt * s.rig.left.fu / depth

@@ -1,19 +1,17 @@
-"""What the detector's parts know of the frame in work, and the camera's last poses from any back end."""
+"""What the detector's parts know of the frame in work."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from slam.bodies.config import ObjectsConfig
-from slam.data import Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
+from slam.data import IdArray, IndexArray, RecentPoses, StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
+from slam.geometry.se3 import Array
 from slam.models import EstimatorModels, ObjectModels
 
 _SHARE = 0.05  # of the depth, as the radius of what may be a body where bodies have no least size
@@ -103,40 +101,3 @@ class Frame:
 
 
 NO_IDS: IdArray = np.zeros(0, np.int64)  #: none
-
-
-@dataclass(frozen=True, eq=False)
-class OnlinePose:
-    """The camera's pose in a frame as it was estimated then."""
-
-    rig: StereoRig
-    sigma: float  # pixel noise [px]
-    estimate: Estimate
-    landmarks: Array  # that measured it, in camera coordinates (M, 3) [m]
-
-    @cached_property
-    def noise(self) -> Array:
-        """Covariance (6, 6) by the frame's own noise: what the landmarks would leave uncertain if they were known."""
-        J = (self.rig.project_stereo(self.landmarks)[1] @ points_by_pose(self.landmarks)).reshape(-1, 6)
-        return np.linalg.inv(np.linalg.inv(self.estimate.covariance + 1e-12 * np.eye(6)) + J.T @ J / self.sigma**2)
-
-
-def recent_poses(recent: RecentPoses | None, path: Sequence[OnlinePose]) -> RecentPoses:
-    """The camera's last poses as the back end gives them, or else by its online poses in as many frames.
-
-    Over a few frames nearly all of an online pose's uncertainty is one error that they share: the place in the map. So
-    a pose is off by what the newest is off, carried along, and by the two frames' own noises. The newest pose has just
-    its covariance (6, 6). A back end that has corrected its past may give fewer poses for a while.
-    """
-    k = len(path)
-    if recent is not None and len(recent) >= k:
-        return recent
-    stamps = np.array([online.estimate.stamp for online in path])
-    poses = np.stack([online.estimate.T_world_left for online in path])
-    by_newest = adjoint(inverse(poses) @ poses[-1])  # of a common error, as each pose's perturbation
-    stacked = by_newest.reshape(6 * k, 6)
-    P = stacked @ path[-1].estimate.covariance @ stacked.T
-    if k > 1:
-        earlier = stacked[:-6]
-        P[:-6, :-6] += earlier @ path[-1].noise @ earlier.T + block_diag(*(online.noise for online in path[:-1]))
-    return RecentPoses(stamps, poses, P)

@@ -8,19 +8,19 @@ it is a part of it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
-from slam.bodies.bodies import Body, in_body_axes, with_extent
+from slam.bodies.bodies import Body, hidden, in_body_axes, with_extent
 from slam.bodies.config import CLEAR, EXPLAINED, MIN_FRAMES, ROUNDS, RUN, WINDOW
 from slam.bodies.fits import fit_positions, times_vectors
 from slam.bodies.frame import Frame
-from slam.bodies.track_kernels import LEAST, RIDGE, inverses, squares, weighted_means
+from slam.bodies.track_kernels import LEAST, RIDGE, distances_from_box, inverses, squares, weighted_means
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IndexArray
-from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
+from slam.geometry.arrays import changed
+from slam.geometry.se3 import Array, exp, points_by_pose, transform
 from slam.tracks.table import Tracks
 
 MARGIN = 0.25  # how far from a body's extent its further features may lie, as a share of the extent's diagonal
@@ -51,9 +51,9 @@ def _limits(most: int) -> Array:
 
 def fitted(body: Body, tracks: Tracks, rows: IndexArray, slot: int) -> Body:
     """A new body with its poses over the window, which were those of a constant velocity, fitted to tracks."""
-    body = _with_poses_fitted(replace(body, known=np.asarray(tracks.dof[rows].any(axis=0))), tracks, rows)
+    body = _with_poses_fitted(changed(body, known=np.asarray(tracks.dof[rows].any(axis=0))), tracks, rows)
     points, A, _ = in_body_axes(body, tracks, rows)
-    return with_extent(replace(body, T=body.history[slot]), weighted_means(points, A))
+    return with_extent(changed(body, T=body.history[slot]), weighted_means(points, A))
 
 
 def _with_poses_fitted(body: Body, tracks: Tracks, rows: IndexArray) -> Body:
@@ -65,7 +65,7 @@ def _with_poses_fitted(body: Body, tracks: Tracks, rows: IndexArray) -> Body:
         JA = np.swapaxes(J, 1, 2)[:, None] @ A
         normal = (JA @ J[:, None]).sum(axis=0) + _OFF**-2 * np.eye(6)
         right = times_vectors(JA, points - y[:, None]).sum(axis=0)
-        body = replace(body, history=body.history @ exp(np.linalg.solve(normal, right[..., None])[..., 0]))
+        body = changed(body, history=body.history @ exp(np.linalg.solve(normal, right[..., None])[..., 0]))
     return body
 
 
@@ -98,7 +98,8 @@ def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> d
     """Add the tracks that fit a measured body to its members, and remove those that do not, in place.
 
     Inside a body that stereo resolves no proof of motion is needed. Returns by how much χ² each body explains its seen
-    members better than the still world (K,), and for how many others inside it the still world is clearly better.
+    members better than the still world (K,), and for how many others the still world is clearly better: inside it, and
+    behind one that is not proven, through which nothing should be seen.
     """
     said: dict[int, tuple[Array, int]] = {}
     bodies = {id: body for id, body in every.items() if body.measured}
@@ -111,6 +112,9 @@ def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> d
     for body in bodies.values():
         near = np.flatnonzero(_distances(body, tracks, free, MARGIN) < _NEAR)
         gain, against = _gain_of_joining(body, frame.resolves(body.T[:3, 3]), tracks, free[near])
+        if not body.proven:
+            behind = free[hidden([body], frame.eye, tracks.position[free])]
+            against += int((membership_test(body, tracks, behind)[0] < -CLEAR).sum())
         said[body.id] = kept[body.id], against
         better = gain > best[near]
         best[near[better]], whose[near[better]] = gain[better], body.id
@@ -214,7 +218,7 @@ def distinctness(one: Body, ones: IndexArray, other: Body, others: IndexArray, t
     The increase of χ² if all share the poses of one, relative to its 99 % limit.
     """
     both = one.known & other.known
-    one, other = replace(one, known=both), replace(other, known=both)
+    one, other = changed(one, known=both), changed(other, known=both)
 
     def left(body: Body, rows: IndexArray) -> float:
         return float(squares(*in_body_axes(_with_poses_fitted(body, tracks, rows), tracks, rows)[:2]).sum())
@@ -227,10 +231,10 @@ def distinctness(one: Body, ones: IndexArray, other: Body, others: IndexArray, t
 def _distances(body: Body, tracks: Tracks, rows: IndexArray, margin: float) -> Array:
     """Squared distances (N,) of tracks from a body's extent, widened by a share `margin`, in their own noise."""
     wider = margin * body.across
-    local = transform(inverse(body.T), tracks.position[rows])
-    away = (local - np.clip(local, body.lower - wider, body.upper + wider)) @ body.T[:3, :3].T
-    P = inverses(tracks.covariance[rows], RIDGE, LEAST)
-    return np.asarray((away * times_vectors(P, away)).sum(axis=1))
+    found: Array = distances_from_box(
+        body.T, body.lower - wider, body.upper + wider, tracks.position, tracks.covariance, rows
+    )
+    return found
 
 
 def _improve(body: Body, tracks: Tracks, slot: int) -> None:
@@ -262,10 +266,10 @@ def merge(bodies: dict[int, Body], tracks: Tracks) -> None:
         for other in [b for b in bodies.values() if b.id < id and b.measured and b.id not in body.distinct]:
             apart = _apart(body, mine, other, _members(tracks, other.id), tracks)
             if apart > _DISTINCT:
-                body = replace(body, distinct=body.distinct | {other.id})
+                body = changed(body, distinct=body.distinct | {other.id})
             elif apart < 1.0 and whole is None:
                 whole = other
-        body = bodies[id] = replace(body, alike=0 if whole is None else body.alike + 1)
+        body = bodies[id] = changed(body, alike=0 if whole is None else body.alike + 1)
         if whole is None or not (body.alike > 2 * WINDOW or (body.seen < 2 * WINDOW and whole.id != body.apart_from)):
             continue
         add_members(whole, tracks, mine, sure=True)

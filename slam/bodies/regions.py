@@ -8,7 +8,7 @@ tracks come and go. A region that is followed over more than its own size is har
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from slam.bodies.config import MIN_FRAMES, RUN
 from slam.bodies.fits import AGREES, MOVES, ConstantVelocity, constant_velocity
 from slam.bodies.frame import Frame
 from slam.data import BoolArray, IndexArray
+from slam.geometry.arrays import changed
 from slam.geometry.kernels import squared_distances
 from slam.geometry.rig import MINIMAL_POINTS
 from slam.geometry.se3 import Array
@@ -44,7 +45,7 @@ class Region:
         F[:3, 3:] = frame.dt * np.eye(3)
         P = F @ self.covariance @ F.T
         P[3:, 3:] += frame.setup.models.acceleration**2 * frame.dt * np.eye(3)
-        return replace(self, state=F @ self.state, covariance=P, way=self.way + frame.dt * self.state[3:])
+        return changed(self, state=F @ self.state, covariance=P, way=self.way + frame.dt * self.state[3:])
 
     def has_moved(self, frame: Frame) -> bool:
         """Whether it has gone farther than it is wide, by its velocity: taking up other still tracks takes it, too."""
@@ -68,7 +69,7 @@ class Region:
         vector[:3] += (places @ m.position[rows, :, None]).sum(axis=0)[:, 0]
         vector[3:] += (velocities @ m.velocity[rows, :, None]).sum(axis=0)[:, 0]
         P = np.linalg.inv(information)
-        return replace(self, state=P @ vector, covariance=P)
+        return changed(self, state=P @ vector, covariance=P)
 
 
 def follow_regions(regions: list[Region], frame: Frame, tracks: Tracks) -> tuple[list[Region], list[Region]]:
@@ -103,9 +104,9 @@ def follow_regions(regions: list[Region], frame: Frame, tracks: Tracks) -> tuple
             r = r.corrected(m, spread, np.flatnonzero(mine))
             own = rows[mine & off(r)[1]]  # where its place was hardly known, from everywhere
             frames, size = r.frames + (len(own) >= MINIMAL_POINTS), float(radius[mine].mean())
-            r = replace(r, rows=own, frames=frames, unseen=0, radius=size)
+            r = changed(r, rows=own, frames=frames, unseen=0, radius=size)
         else:
-            r = replace(r, rows=rows[:0], unseen=r.unseen + 1)
+            r = changed(r, rows=rows[:0], unseen=r.unseen + 1)
         if r.unseen <= RUN:
             followed.append(r)
     followed += _new_regions(m, spread, radius, rows, np.flatnonzero(free))
@@ -117,19 +118,20 @@ def _new_regions(
     m: ConstantVelocity, spread: Array, radius: Array, rows: IndexArray, free: IndexArray
 ) -> list[Region]:  # fmt: skip
     """Regions of free tracks (K,) that lie together and move alike, the largest first: two at least."""
-    place, P, V = m.position[free], m.covariance[free], m.velocity_covariance[free]
-    alike = [
-        (squared_distances(place - place[i], spread[free] + P + P[i] + spread[free[i]]) < _NEAR)
-        & (squared_distances(m.velocity[free] - m.velocity[free[i]], V + V[i]) < AGREES)
-        for i in range(len(free))
-    ]
+    place, velocity, n = m.position[free], m.velocity[free], len(free)
+    P, V, S = m.covariance[free], m.velocity_covariance[free], spread[free]
+    apart = (place - place[:, None]).reshape(-1, 3), (S + P + P[:, None] + S[:, None]).reshape(-1, 3, 3)
+    faster = (velocity - velocity[:, None]).reshape(-1, 3), (V + V[:, None]).reshape(-1, 3, 3)
+    alike = (squared_distances(*apart) < _NEAR) & (squared_distances(*faster) < AGREES)
+    alike = alike.reshape(n, n)
+    size = alike.sum(axis=1)
     left, regions = np.ones(len(free), bool), []
-    for i in sorted(range(len(free)), key=lambda i: -int(alike[i].sum())):
+    for i in np.argsort(-size, kind="stable"):
         group = free[alike[i] & left]
         if left[i] and len(group) >= 2:
             left &= ~alike[i]
             none, frames = np.zeros(6), int(len(group) >= MINIMAL_POINTS)
             r = Region(float(radius[group].mean()), rows[group], none, 1e12 * np.eye(6), none[:3], none[:3], frames)
             r = r.corrected(m, spread, group)
-            regions.append(replace(r, start=r.state[:3]))
+            regions.append(changed(r, start=r.state[:3]))
     return regions

@@ -12,7 +12,7 @@ from slam.bodies.config import CLEAR
 from slam.chi_square import chi_square_limit
 from slam.kernels.linear import factorise, solve_factorised, square
 from slam.kernels.se3 import point_by_motion
-from slam.runtime.compilation import helper, kernel
+from slam.runtime.compilation import disjoint_helper, helper, kernel
 
 PRIOR = np.array([1e-4] * 3 + [1e-6] * 3)  #: keeps Λ of nearly collinear tracks invertible [1/rad², 1/m²]
 _PULL = 16.0  # no track brings more χ² than this: single false ones find no company
@@ -31,97 +31,111 @@ MEDIAN = chi_square_limit(3, 0.5)  #: of χ²(3)
 
 @kernel
 def normal_equations(points, d, W, lag):
-    """Each track's Λ (N, 21), η (N, 6), and dᵀ W d (N,), of displacements d with information W at `points`."""
+    """Each track's Λ, η and dᵀ W d side by side (N, 28), of displacements d with information W at `points`."""
     n = len(d)
-    L, eta, dWd = np.empty((n, 21)), np.zeros((n, 6)), np.empty(n)
+    sums = np.zeros((n, 28))
     J, WJ = np.empty((3, 6)), np.empty((3, 6))
     for m in range(n):
         point_by_motion(points[m], lag[m], J)
         for i in range(3):
             for j in range(6):
                 WJ[i, j] = W[m, i, 0] * J[0, j] + W[m, i, 1] * J[1, j] + W[m, i, 2] * J[2, j]
-                eta[m, j] += WJ[i, j] * d[m, i]
-        dWd[m] = square(W[m], d[m])
+                sums[m, 21 + j] += WJ[i, j] * d[m, i]
+        sums[m, 27] = square(W[m], d[m])
         k = 0
         for i in range(6):
             for j in range(i + 1):
-                L[m, k] = J[0, i] * WJ[0, j] + J[1, i] * WJ[1, j] + J[2, i] * WJ[2, j]
+                sums[m, k] = J[0, i] * WJ[0, j] + J[1, i] * WJ[1, j] + J[2, i] * WJ[2, j]
                 k += 1
-    return L, eta, dWd
+    return sums
 
 
 @helper
-def _common_motion(L, eta, dWd, rows, work, out):
-    """The motion ξ (6,) on which some tracks agree, by reweighted least squares, into `out`."""
-    weight, total, told, products, factor = work
-    weight[:] = 1.0
+def _by_column(sums, rows, count):
+    """Sums (N, 28) of the first `count` of the `rows`, and the same by column (28, N): for loops over tracks."""
+    own, columns = np.empty((count, 28)), np.empty((28, count))
+    for m in range(count):
+        for k in range(28):
+            own[m, k] = columns[k, m] = sums[rows[m], k]
+    return own, columns
+
+
+@helper
+def _common_motion(sums, columns, members, out):
+    """The motion ξ (6,) on which the tracks that are `members` (N,) agree, by reweighted least squares, into `out`."""
+    n = len(sums)
+    weight, off, total, factor = np.empty(n), np.empty(n), np.empty(28), np.empty((6, 6))
+    for m in range(n):
+        weight[m] = 1.0 if members[m] else 0.0
     for k in range(_SOFT + _SHARP):
-        total[:], told[:] = 0.0, 0.0
-        for m in range(len(dWd)):
-            if rows[m]:
-                _add_weighted(total, L[m], weight[m])
-                _add_weighted(told, eta[m], weight[m])
+        total[:] = 0.0
+        for m in range(n):
+            _add_weighted(total, sums[m], weight[m])
         _factorise(total, 1.0, factor)
-        _solve(factor, told, out)
-        _products(out, products)
-        changed = False
-        for m in range(len(dWd)):
-            if rows[m]:
-                share = min(1.0, _PULL / max(_square(L[m], eta[m], dWd[m], out, products), 1e-9))
-                changed = changed or share < 1.0 or weight[m] < 1.0
-                weight[m] = np.sqrt(share) if k < _SOFT else share
-        if not changed:  # nor would it in the next round
-            break
+        _solve(factor, total[21:27], out)
+        _squares_against(columns, out, off)
+        _reweigh(off, members, k < _SOFT, weight)
 
 
-@helper
-def _squares_against(L, eta, dWd, motion, scale, products, out):
-    """χ²(3) of every displacement against a motion ξ (6,), divided by `scale`, into `out` (N,)."""
-    _products(motion, products)
-    for m in range(len(dWd)):
-        out[m] = _square(L[m], eta[m], dWd[m], motion, products) / scale
-
-
-@helper
+@disjoint_helper
 def _add_weighted(total, part, weight):
     for k in range(len(total)):
         total[k] += weight * part[k]
 
 
+@disjoint_helper
+def _reweigh(off, members, soft, weight):
+    """Weights (N,) of the members by their χ²."""
+    for m in range(len(off)):
+        share = min(1.0, _PULL / max(off[m], 1e-9)) if members[m] else 0.0
+        weight[m] = np.sqrt(share) if soft else share
+
+
 @helper
-def _products(motion, out):
-    """Products of a motion's entries, so that ``ξᵀ Λ ξ`` is a sum over the triangle of Λ."""
+def _squares_against(columns, motion, out):
+    """χ²(3) of every displacement against a motion ξ (6,), into `out` (N,).
+
+    ``ξᵀ Λ ξ`` is a sum over the triangle of Λ with the products of the motion's entries.
+    """
+    products = np.empty(21)
     k = 0
     for i in range(6):
         for j in range(i):
-            out[k] = 2 * motion[i] * motion[j]
+            products[k] = 2 * motion[i] * motion[j]
             k += 1
-        out[k] = motion[i] * motion[i]
+        products[k] = motion[i] * motion[i]
         k += 1
+    _squares(columns, products, motion, out)
 
 
-@helper
-def _square(L, eta, dWd, motion, products):
-    """χ²(3) of a displacement against a motion, in sums that need not wait for one another."""
-    s0 = s1 = s2 = s3 = 0.0
-    for k in range(7):
-        s0 += L[k] * products[k]
-        s1 += L[k + 7] * products[k + 7]
-        s2 += L[k + 14] * products[k + 14]
-    for i in range(6):
-        s3 += eta[i] * motion[i]
-    return dWd + (s0 + s1 + s2) - 2 * s3
+@disjoint_helper
+def _squares(columns, products, motion, out):
+    for m in range(len(out)):
+        s0 = s1 = s2 = s3 = 0.0
+        for k in range(7):
+            s0 += columns[k, m] * products[k]
+            s1 += columns[k + 7, m] * products[k + 7]
+            s2 += columns[k + 14, m] * products[k + 14]
+        for i in range(6):
+            s3 += columns[21 + i, m] * motion[i]
+        out[m] = columns[27, m] + (s0 + s1 + s2) - 2 * s3
 
 
 @helper
 def _factorise(triangle, priors, out):
     """A triangle's matrix, with so many priors on its diagonal, through `factorise`."""
+    _unfold(triangle, priors, out)
+    factorise(out, 6)
+
+
+@helper
+def _unfold(triangle, priors, out):
+    """A triangle's matrix, with so many priors on its diagonal."""
     k = 0
     for i in range(6):
         for j in range(i + 1):
-            out[i, j] = triangle[k] + (priors * PRIOR[i] if i == j else 0.0)
+            out[i, j] = out[j, i] = triangle[k] + (priors * PRIOR[i] if i == j else 0.0)
             k += 1
-    factorise(out, 6)
 
 
 @helper
@@ -139,20 +153,18 @@ def _solve(factor, right, out):
 def window_codes(place, sizes):
     """A number for every window that a track at `place` (N, 3) is in, and the track itself in its last digits.
 
-    Windows have `sizes` (S, 3), and each is half a width from the next along every axis: eight overlap. Sorted (8 S N,)
-    numbers have each window's tracks in a row.
+    Windows have `sizes` (S, 3), and each is half a width from the next along every axis: eight overlap. Rows of the
+    numbers (8 S, N) are of one kind of window each; sorted, they have each window's tracks side by side.
     """
     n = len(place)
-    codes = np.empty(8 * len(sizes) * n, np.int64)
-    k = 0
+    codes = np.empty((8 * len(sizes), n), np.int64)
     for kind in range(8 * len(sizes)):
         for m in range(n):
             code = kind
             for axis in range(3):
                 cell = np.floor(place[m, axis] / sizes[kind // 8, axis] + _shift(kind, axis))
                 code = code * _CELLS + min(max(int(cell) + _CELLS // 2, 0), _CELLS - 1)
-            codes[k] = code * n + m
-            k += 1
+            codes[kind, m] = code * n + m
     return codes
 
 
@@ -162,35 +174,37 @@ def _shift(kind, axis):
     return 0.5 * (kind >> (2 - axis) & 1)
 
 
-@kernel
-def full_windows(codes, n, sizes, least):
-    """Windows with at least so many of n tracks, by the sorted `window_codes`.
+@helper
+def _full_windows(codes, sizes, least):
+    """Windows with at least so many tracks, by the sorted `window_codes`.
 
     As starts (M + 1,) of the windows in the list of their tracks, that list, and centres and widths (M, 3).
     """
-    most = len(codes) // least + 1
-    starts, tracks = np.empty(most + 1, np.int64), np.empty(len(codes), np.int64)
+    kinds, n = codes.shape
+    most = kinds * n // least + 1
+    starts, tracks = np.empty(most + 1, np.int64), np.empty(kinds * n, np.int64)
     centres, widths = np.empty((most, 3)), np.empty((most, 3))
-    windows = size = first = 0
+    windows = size = 0
     starts[0] = 0
-    for k in range(len(codes)):
-        code = codes[k] // n
-        if k + 1 < len(codes) and codes[k + 1] // n == code:
-            continue
-        if k + 1 - first >= least:
-            for i in range(first, k + 1):
-                tracks[size] = codes[i] - code * n
-                size += 1
-            kind = code // _CELLS**3
-            for axis in range(2, -1, -1):
-                widths[windows, axis] = sizes[kind // 8, axis]
-                cell = code % _CELLS - _CELLS // 2
-                centres[windows, axis] = (cell + 0.5 - _shift(kind, axis)) * widths[windows, axis]
-                code //= _CELLS
-            windows += 1
-            starts[windows] = size
-        first = k + 1
-    return starts[: windows + 1], tracks[:size], centres[:windows], widths[:windows]
+    for kind in range(kinds):
+        first = 0
+        for k in range(n):
+            code = codes[kind, k] // n
+            if k + 1 < n and codes[kind, k + 1] // n == code:
+                continue
+            if k + 1 - first >= least:
+                for i in range(first, k + 1):
+                    tracks[size] = codes[kind, i] - code * n
+                    size += 1
+                for axis in range(2, -1, -1):
+                    widths[windows, axis] = sizes[kind // 8, axis]
+                    cell = code % _CELLS - _CELLS // 2
+                    centres[windows, axis] = (cell + 0.5 - _shift(kind, axis)) * widths[windows, axis]
+                    code //= _CELLS
+                windows += 1
+                starts[windows] = size
+            first = k + 1
+    return starts[: windows + 1], tracks, centres, widths
 
 
 @helper
@@ -205,7 +219,7 @@ def _gain(triangle, gradient, factor, work):
 
 
 @helper
-def _window_tests(starts, tracks, L, eta, dWd, alone, scale, rest, asked, support, largest, clear):
+def _window_tests(windows, sums, columns, alone, scale, rest, asked, support, largest, clear):
     """By how much the χ²(6) of every window exceeds what is asked, into `clear` (M,); −∞ where it does not.
 
     The test is whether the tracks inside move as the rest; `asked` (N + 1,) is by their number. It is what both gain by
@@ -213,18 +227,17 @@ def _window_tests(starts, tracks, L, eta, dWd, alone, scale, rest, asked, suppor
     gain is at most the χ² of those inside against ξ, and both together at most the first over 1 − ρ: of the information
     on any motion those inside have no more than ``ρ = tr(Λ⁻¹ Λ_w)``. Most windows need no more than these sums.
     """
-    n = len(alone)
-    total, told, weight, off, hold = np.zeros(21), np.zeros(6), np.zeros(n), np.empty(n), np.empty(n)
+    n, (starts, tracks, _, _) = len(alone), windows
+    total, weight, off, hold = np.zeros(28), np.zeros(n), np.empty(n), np.empty(n)
     for m in range(n):
         if rest[m]:
             weight[m] = min(1.0, _PULL / max(alone[m], 1e-9)) / scale
-            _add_weighted(total, L[m], weight[m])
-            _add_weighted(told, eta[m], weight[m])
-    factor, motion, products, shares = np.empty((6, 6)), np.empty(6), np.empty(21), np.empty(21)
-    inside, outside, gradient, column, unit = np.empty(21), np.empty(21), np.empty(6), np.empty(6), np.zeros(6)
+            _add_weighted(total, sums[m], weight[m])
+    factor, motion, shares, whole = np.empty((6, 6)), np.empty(6), np.empty(21), np.empty((6, 6))
+    inside, outside, gradient, column, unit = np.empty(28), np.empty(21), np.empty(6), np.empty(6), np.zeros(6)
     _factorise(total, 2.0, factor)
-    _solve(factor, told, motion)
-    _products(motion, products)
+    _solve(factor, total[21:27], motion)
+    _squares_against(columns, motion, off)
     prior_off = prior_hold = 0.0
     for i in range(6):
         unit[:] = 0.0
@@ -235,10 +248,10 @@ def _window_tests(starts, tracks, L, eta, dWd, alone, scale, rest, asked, suppor
         for j in range(i + 1):
             shares[i * (i + 1) // 2 + j] = (1.0 if i == j else 2.0) * column[j]
     for m in range(n):
-        off[m] = weight[m] * _square(L[m], eta[m], dWd[m], motion, products)
+        off[m] *= weight[m]
         hold[m] = 0.0
         for k in range(21):
-            hold[m] += weight[m] * L[m, k] * shares[k]
+            hold[m] += weight[m] * sums[m, k] * shares[k]
     for w in range(len(clear)):
         clear[w] = -np.inf
         own = tracks[starts[w] : starts[w + 1]]
@@ -248,14 +261,14 @@ def _window_tests(starts, tracks, L, eta, dWd, alone, scale, rest, asked, suppor
                 size, most, share = size + 1, most + off[m], share + hold[m]
         if size < support or size > largest or most <= asked[size] * (1.0 - share):
             continue
-        inside[:], gradient[:] = 0.0, 0.0
+        inside[:] = 0.0
         for m in own:
-            _add_weighted(inside, L[m], weight[m])
-            _add_weighted(gradient, eta[m], -weight[m])
+            _add_weighted(inside, sums[m], weight[m])
+        _unfold(inside, 0.0, whole)
         for i in range(6):
-            gradient[i] += PRIOR[i] * motion[i]
+            gradient[i] = PRIOR[i] * motion[i] - inside[21 + i]
             for j in range(6):
-                gradient[i] += inside[max(i, j) * (max(i, j) + 1) // 2 + min(i, j)] * motion[j]
+                gradient[i] += whole[i, j] * motion[j]
         value = _gain(inside, gradient, factor, column)
         if value <= asked[size] * (1.0 - share):
             continue
@@ -266,76 +279,94 @@ def _window_tests(starts, tracks, L, eta, dWd, alone, scale, rest, asked, suppor
             clear[w] = value
 
 
+@helper
+def _next_group(windows, clear, sums, columns, place, scale, asked, support, rest, rows):
+    """The group of the clearest window that has one: its tracks, marked in `rows` (N,), their number, and its χ²(6)."""
+    n, (starts, tracks, centres, widths) = len(sums), windows
+    seeds, doubted, members, every = np.empty(n, np.bool_), ~rest, np.empty(n, np.intp), np.ones(n, np.bool_)
+    motion, apart, fits = np.empty(6), np.empty(n), np.empty(n)
+    for _ in range(_MOST):
+        window = np.argmax(clear)
+        if clear[window] <= 0:
+            break
+        inside, found = 0, 0
+        seeds[:] = False
+        for m in tracks[starts[window] : starts[window + 1]]:
+            seeds[m] = not doubted[m]
+            inside += rest[m]
+            found += seeds[m]
+        value, clear[window] = clear[window] + asked[inside], -np.inf
+        if found < support:
+            continue
+        for m in range(n):
+            rows[m] = rest[m] and not seeds[m]
+        _common_motion(sums, columns, rows, motion)
+        _squares_against(columns, motion, apart)
+        for m in range(n):  # a slice would make Numba compile messages about shapes, for two seconds
+            rows[m] = seeds[m]
+        for _ in range(2):
+            if found < support:
+                break
+            count = 0
+            for m in range(n):
+                if rows[m]:
+                    members[count] = m
+                    count += 1
+            _common_motion(*_by_column(sums, members, count), every, motion)
+            _squares_against(columns, motion, fits)
+            found = 0
+            for m in range(n):
+                one, other = fits[m] / scale, apart[m] / scale
+                rows[m] = rest[m] and one < max(FITS, _EXPLAINED * other)
+                rows[m] = rows[m] and other - one > (_BETTER if seeds[m] else CLEAR)
+                for axis in range(3):
+                    off = abs(place[m, axis] - centres[window, axis])
+                    rows[m] = rows[m] and off < (0.5 + _AROUND) * widths[window, axis]
+                found += rows[m]
+        if found >= support:
+            return found, value
+        for m in range(n):
+            doubted[m] = doubted[m] or seeds[m]
+    return 0, 0.0
+
+
 @kernel
-def groups_apart(L, eta, dWd, place, starts, tracks, centres, widths, asked, support):
+def groups_apart(sums, place, codes, sizes, asked, support):
     """Groups of tracks that moved alike, and otherwise than the rest: the clearest first, until there is none.
 
-    Tracks have sums as of `normal_equations` and are seen at `place` (N, 3). Windows of `centres` and `widths` (M, 3)
-    have `starts` (M + 1,) in the list of their `tracks`; `asked` (N + 1,) is the χ²(6) from which one with so many
-    moved. Returns the group of each track (N,), −1 for the rest; χ²(6) of each group (G,); χ²(3) of every track against
-    the rest (N,); the rest's common motion (6,); and the ratio by which χ² was divided, 1 at least.
+    Tracks have `sums` (N, 28) as of `normal_equations` and are seen at `place` (N, 3), in windows of `sizes` (S, 3)
+    that have sorted `codes` (8 S, N) and at least `support` tracks; `asked` (N + 1,) is the χ²(6) from which one with
+    so many moved. Returns the group of each track (N,), −1 for the rest; χ²(6) of each group (G,); χ²(3) of every track
+    against the rest (N,); the rest's common motion (6,), and the information (6, 6) on it; and the ratio by which χ²
+    was divided, 1 at least.
     """
-    n = len(dWd)
-    work = np.empty(n), np.empty(21), np.empty(6), np.empty(21), np.empty((6, 6))
-    group, values, common, motion = np.full(n, -1), np.empty(n), np.empty(6), np.empty(6)
-    alone, apart, fits, clear = np.empty(n), np.empty(n), np.empty(n), np.empty(len(centres))
-    rest, seeds, rows = np.ones(n, np.bool_), np.empty(n, np.bool_), np.empty(n, np.bool_)
-    doubted = np.zeros(n, np.bool_)
-    scale, groups, left = 1.0, 0, n
+    n = len(sums)
+    _, columns = _by_column(sums, np.arange(n), n)
+    windows = _full_windows(codes, sizes, support)
+    clear = np.empty(len(windows[0]) - 1)
+    group, values, common, alone = np.full(n, -1), np.empty(n), np.empty(6), np.empty(n)
+    rest, rows = np.ones(n, np.bool_), np.empty(n, np.bool_)
+    groups, left = 0, n
     while True:
-        _common_motion(L, eta, dWd, rest, work, common)
-        _squares_against(L, eta, dWd, common, 1.0, work[3], alone)
+        _common_motion(sums, columns, rest, common)
+        _squares_against(columns, common, alone)
         scale = max(1.0, np.median(alone[rest]) / MEDIAN)
         for m in range(n):
             alone[m] /= scale
-            doubted[m] = not rest[m]
         if 3 * left < n or len(clear) == 0:
             break
-        _window_tests(starts, tracks, L, eta, dWd, alone, scale, rest, asked, support, LARGEST * left, clear)
-        found = 0
-        for _ in range(_MOST):
-            window = np.argmax(clear)
-            if clear[window] <= 0:
-                break
-            inside, size = 0, 0
-            seeds[:] = False
-            for m in tracks[starts[window] : starts[window + 1]]:
-                seeds[m] = not doubted[m]
-                inside += rest[m]
-                size += seeds[m]
-            value, clear[window] = clear[window] + asked[inside], -np.inf
-            if size < support:
-                continue
-            for m in range(n):
-                rows[m] = rest[m] and not seeds[m]
-            _common_motion(L, eta, dWd, rows, work, motion)
-            _squares_against(L, eta, dWd, motion, scale, work[3], apart)
-            for m in range(n):  # a slice would make Numba compile messages about shapes, for two seconds
-                rows[m] = seeds[m]
-            found = size
-            for _ in range(2):
-                if found < support:
-                    break
-                _common_motion(L, eta, dWd, rows, work, motion)
-                _squares_against(L, eta, dWd, motion, scale, work[3], fits)
-                found = 0
-                for m in range(n):
-                    rows[m] = rest[m] and fits[m] < max(FITS, _EXPLAINED * apart[m])
-                    rows[m] = rows[m] and apart[m] - fits[m] > (_BETTER if seeds[m] else CLEAR)
-                    for axis in range(3):
-                        off = abs(place[m, axis] - centres[window, axis])
-                        rows[m] = rows[m] and off < (0.5 + _AROUND) * widths[window, axis]
-                    found += rows[m]
-            if found >= support:
-                for m in range(n):
-                    if rows[m]:
-                        group[m], rest[m] = groups, False
-                values[groups] = value
-                groups, left = groups + 1, left - found
-                break
-            found = 0
-            for m in range(n):
-                doubted[m] = doubted[m] or seeds[m]
+        _window_tests(windows, sums, columns, alone, scale, rest, asked, support, LARGEST * left, clear)
+        found, value = _next_group(windows, clear, sums, columns, place, scale, asked, support, rest, rows)
         if found == 0:
             break
-    return group, values[:groups].copy(), alone, common, scale
+        for m in range(n):
+            if rows[m]:
+                group[m], rest[m] = groups, False
+        values[groups] = value
+        groups, left = groups + 1, left - found
+    total, information = np.zeros(28), np.empty((6, 6))
+    for m in range(n):
+        if rest[m]:
+            _add_weighted(total, sums[m], 1.0)
+    _unfold(total, 1.0, information)
+    return group, values[:groups].copy(), alone, common, information, scale

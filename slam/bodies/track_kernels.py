@@ -229,7 +229,40 @@ def squares(points, A):
     return out
 
 
+@kernel
+def distances_from_box(T, lower, upper, position, covariance, rows):
+    """Squared distances (M,), in their own noise, of tracks from the box between two corners in a body's axes T."""
+    out, local, away, gap, P = np.empty(len(rows)), np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
+    for m in range(len(rows)):
+        transform_back(T, position[rows[m]], local)
+        for i in range(3):
+            away[i] = local[i] - min(max(local[i], lower[i]), upper[i])
+        for i in range(3):
+            gap[i] = row_times(T, i, away)
+        invert_symmetric(covariance[rows[m]], RIDGE * trace(covariance[rows[m]]) + LEAST, P)
+        out[m] = square(P, gap)
+    return out
+
+
 # ---------------------------------------------------------------------------------------------- pixels
+
+
+@kernel
+def expected_pixels(camera, T_world_left, position, covariance, rows, sigma):
+    """Pixels (M, 3) at which tracks are expected, NaN behind the camera, and their innovation covariances (M, 3, 3)."""
+    n = len(rows)
+    z, S, none = np.empty((n, 3)), np.empty((n, 3, 3)), np.zeros(3)
+    local, J, G = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    for m in range(n):
+        transform_back(T_world_left, position[rows[m]], local)
+        residual(camera, local, none, z[m], J)
+        for i in range(3):
+            z[m, i] = -z[m, i]
+            by_point(J[i], T_world_left, G[i])
+        turn(G, covariance[rows[m]], S[m])
+        for i in range(3):
+            S[m, i, i] += sigma * sigma
+    return z, S
 
 
 @kernel

@@ -7,23 +7,19 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO
 
 from slam.errors import PartError, SlamError, one_line
 from slam.files import reason
 
-if TYPE_CHECKING:
-    from slam.data import FrameResult
-
 #: Signals that end a run with all its files: Ctrl-C, a request to end, a closed terminal.
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 
-_pending: list[int] = []  # a signal that waits for the end of a frame
-_in_frames = False
-_until: threading.Event | None = None  # ends the frames of a live run
+_until: threading.Event | None = None  # that a run looks at after each frame
+_received = 0  # the signal that set it
 
 
 class Stopped(BaseException):
@@ -45,49 +41,31 @@ def catch_signals() -> None:
 
 
 def _stop(number: int, frame: object) -> None:
-    """Stop at once; while frames are worked on, after the present one, so that all files agree. Twice: at once.
-
-    Frames of a live run are not waited for any more; that is how one from a camera ends.
-    """
-    if not _in_frames or _pending or (_until is not None and _until.is_set()):
+    """Stop at once; a run after its present frame, so that all files agree. Twice: at once."""
+    global _received
+    if _until is None or _until.is_set():
         raise Stopped(number)
-    if _until is not None:
-        _until.set()
-        if number == signal.SIGINT:
-            return
-    _pending.append(number)
+    _received = number
+    _until.set()
 
 
 @contextmanager
-def whole_frames(
-    after_frame: Callable[[FrameResult], None], folder: Path, until: threading.Event | None = None
-) -> Iterator[Callable[[FrameResult], None]]:
-    """A callback for the end of every frame, at which a signal that came meanwhile takes effect.
+def ended_by_signals(folder: Path, live: bool = False) -> Iterator[threading.Event]:
+    """What a signal sets, so that a run has no more frames; it raises `Stopped` when the run has left its files.
 
-    It calls `after_frame`, too. A signal's message names the run's `folder`. Where there is `until`, a signal sets it:
-    its run then has no more frames, and Ctrl-C has no further effect.
+    Ctrl-C is how a `live` run ends, and has no further effect there. A signal's message names the run's `folder`.
     """
-    global _in_frames, _until
-    done = 0
-
-    def end_of_frame(result: FrameResult) -> None:
-        nonlocal done
-        after_frame(result)
-        done += 1
-        if _pending:
-            raise Stopped(_pending.pop())
-
-    _in_frames, _until = True, until
+    global _until
+    _until = until = threading.Event()
     try:
-        yield end_of_frame
-        if _pending:  # no frame came after it
-            raise Stopped(_pending.pop())
+        yield until
+        if until.is_set() and not (live and _received == signal.SIGINT):
+            raise Stopped(_received)
     except Stopped as stopped:
-        kept = f"frames done so far are kept: `slam plot {shlex.quote(str(folder))}` draws them"
-        stopped.leaves = kept if done else "no frame was done yet"
+        stopped.leaves = f"frames done so far are kept: `slam plot {shlex.quote(str(folder))}` draws them"
         raise
     finally:
-        _in_frames, _until = False, None
+        _until = None
 
 
 @contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -17,7 +16,7 @@ import typer
 
 from slam.calibration import load_calibration
 from slam.commands.display import print_summary, progress
-from slam.commands.ending import whole_frames
+from slam.commands.ending import ended_by_signals
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError
 from slam.files import note_input, noting_inputs
@@ -66,12 +65,12 @@ def run_sequence(
             watches.append(stack.enter_context(viewing.Viewer(viewer, opened.rig, opened.ground_truth)).show)
         if draw is not None:
             watches.append(stack.enter_context(drawing.FramePictures(draw)).show)
-        until = threading.Event() if options.live or is_live(opened) else None
-        if until is not None and not quiet:
+        live = options.live or is_live(opened)
+        if live and not quiet:
             what = "are taken until" if is_live(opened) else "come at their own rate, to the last one or until"
             print(f"slam: loading; then frames {what} Ctrl-C ends the run", file=sys.stderr)
-        end_of_frame = stack.enter_context(whole_frames(tell, folder, until))
-        summary = run(opened, options, end_of_frame, watches=watches, until=until, record=gathered)
+        until = stack.enter_context(ended_by_signals(folder, live))
+        summary = run(opened, options, tell, watches=watches, until=until, record=gathered)
     finish(summary, written, picture, quiet)
 
 
@@ -87,8 +86,8 @@ def run_recorded(
     with run_folder(out, loaded.name, name) as folder:
         options = RunOptions(name, "recording", config, folder, kind=loaded.kind, command=command_line())
         require_outputs(options.outputs, [recording], overwrite)
-        with progress(len(loaded), _title(loaded, name), quiet) as tell, whole_frames(tell, folder) as end_of_frame:
-            summary = run_recording(loaded, options, end_of_frame)
+        with progress(len(loaded), _title(loaded, name), quiet) as tell, ended_by_signals(folder) as until:
+            summary = run_recording(loaded, options, tell, until=until)
     finish(summary, options.outputs, picture, quiet)
 
 

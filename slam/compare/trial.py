@@ -159,12 +159,9 @@ class MapRecord:
 
     def add(self, result: FrameResult) -> None:
         """One more frame."""
-        number, features = self._start + result.index, result.features
         if self._truth is not None:
-            if self._associations:
-                errors = self._truth.errors(number, result.matched, features.uv_left[result.matched_features])
-                self._right += (errors[np.isfinite(errors)] < _RIGHT).tolist()
-            self._truth.add(number, result.added, features.uv_left[result.added_features])
+            right = self._truth.of_matches(self._start + result.index, result) < _RIGHT
+            self._right += right.tolist() if self._associations else []
         self._sizes.append(result.map_size)
 
     def figures(self, record: RunRecord, out: Path) -> dict[str, float]:

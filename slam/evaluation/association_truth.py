@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.data import IdArray
+from slam.data import FrameResult, IdArray
 from slam.geometry.se3 import Array, inverse, transform
 
 
@@ -49,6 +49,13 @@ class SurfacePoints:
         expected = self._world.rig.left.project(transform(inverse(self._world.ground_truth.poses[frame]), points))
         distance = np.linalg.norm(uv_left - expected, axis=1)
         return np.where(known, np.where(np.isfinite(distance), distance, np.inf), np.nan)
+
+    def of_matches(self, frame: int, result: FrameResult) -> Array:
+        """Take in what was made of a frame; the `errors` of its matches but first sights, infinite ones among them."""
+        uv = result.features.uv_left
+        errors = self.errors(frame, result.matched, uv[result.matched_features])
+        self.add(frame, result.added, uv[result.added_features])
+        return errors[~np.isnan(errors)]
 
 
 def _nearest_pixels(uv: Array, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:

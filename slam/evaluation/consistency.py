@@ -3,7 +3,7 @@
 With ``T_true = T_estimated exp(e)`` the error of the relative pose from frame i to frame j is, to first order,
 ``e_j − A e_i`` with ``A = Ad((T_i⁻¹ T_j)⁻¹)``. Noise makes the errors that are in the covariances N; with C the
 covariance of the later one with the earlier (`slam.evaluation.joint_errors`), that of the difference is
-``N_j + A N_i Aᵀ − C Aᵀ − A Cᵀ``. Where the back end does not tell C, errors count as those of dead reckoning, which
+``N_j + A N_i Aᵀ − C Aᵀ − A Cᵀ``. Where C is not known, errors count as those of dead reckoning, which
 grow by increments that do not depend on what was before: ``C = A N_i``. Errors of the rig are the same in all frames:
 poses are off by ``J_i δ``, so they add ``(J_j − A J_i) Σ (J_j − A J_i)ᵀ`` with Σ as known in frame j. Where the result
 is not positive definite, stretches are left out and counted; where most are, that length has no figure.

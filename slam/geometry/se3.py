@@ -132,6 +132,13 @@ def log(T: Array) -> Array:
     return _each(_log, T, (4, 4), (6,))
 
 
+def twice(R: Array) -> Array:
+    """A rotation (3, 3) of both halves of [rotation, translation] or [ω, v]: ``diag(R, R)`` (6, 6)."""
+    both = np.zeros((6, 6))
+    both[:3, :3] = both[3:, 3:] = R
+    return both
+
+
 def adjoint(T: Array) -> Array:
     """Adjoint (..., 6, 6) of T (..., 4, 4): ``T exp(ξ) T⁻¹ = exp(Ad_T ξ)`` with ξ = [rotation, translation]."""
     R = T[..., :3, :3]

@@ -26,7 +26,7 @@ _BEACON, _NEW, _MOVING, _RING = (0, 230, 255), (80, 200, 80), (0, 0, 0), (255, 2
 _AXES = ((40, 40, 230), (60, 180, 60), (230, 90, 40))  # x red, y green, z blue
 _OLD, _NOW, _PATH, _INK = (200, 200, 200), (200, 130, 30), (0, 110, 240), (90, 90, 90)  # of the map
 #: What is drawn into images, and into the map beside them: colour, name and shape.
-_IN_IMAGES = ((_BEACON, "landmark", "ring"), (_NEW, "new landmark", "ring"), (_MOVING, "feature that moves", "ring"))
+_IN_IMAGES = ((_BEACON, "landmark", "ring"), (_NEW, "new landmark", "ring"), (_MOVING, "feature that may move", "ring"))
 _IN_MAP = ((_PATH, "path", "line"), (_NOW, "landmark now", "dot"), (_OLD, "earlier one", "dot"))
 _EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if i < i ^ bit]
 _FONT, _TEXT = 0, 0.5  # OpenCV's plain font, and its size

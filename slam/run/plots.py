@@ -182,7 +182,7 @@ def _coloured(runs: Sequence[RunData]) -> list[tuple[RunData, str, float]]:
 
 
 def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
-    """The paths, in the world of the first run that has a truth, and the true one, where all have the same.
+    """The paths, in the world of the first run that has a truth, and its true one.
 
     From above, or from the side where the camera moves most up and down.
     """
@@ -301,7 +301,10 @@ def _draw_map(axis: Axes, run: RunData, colour: str) -> Array:
 
 
 def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
-    """Errors of position and rotation, and the σ that is claimed; that alone where no true path is known."""
+    """Errors of position and rotation, and the σ that is claimed; that alone where no true path is known.
+
+    Where the true path has errors of its own, the σ of both together is shown, too.
+    """
     from matplotlib.lines import Line2D
     from matplotlib.ticker import LogLocator
 
@@ -309,10 +312,12 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
     known = any(run.truth is not None for run in runs)
     factor, unit = _unit(max(float(np.nanmax(both[:, 0], initial=0.0)) for _, *pair in series for both in pair))
     for k, (axis, name, times) in enumerate(zip(axes, (f"position [{unit}]", "rotation [deg]"), (factor, 1.0))):
-        for (run, colour, width), (time, error, sigma) in zip(_coloured(runs), series):
+        for (run, colour, width), (time, error, sigma, expected) in zip(_coloured(runs), series):
             if run.truth is not None:
                 axis.plot(time, times * error[:, k], color=colour, lw=0.7 * width)
             axis.plot(time, times * sigma[:, k], "--", color=colour, lw=0.7 * width)
+            if run.truth is not None and run.truth_noise != TruthNoise():
+                axis.plot(time, times * expected[:, k], ":", color=colour, lw=0.7 * width)
             every = run.online.stamps - run.online.stamps[:1]
             for start in every[~run.measured]:
                 axis.axvspan(start, start, color=colour, alpha=0.2)
@@ -335,11 +340,13 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
         end = max(float(np.ptp(run.online.stamps)) for run in runs)  # also where the truth begins later
         axis.set_xlim(-0.01 * end, 1.01 * end or 1.0)
     axes[0].tick_params(labelbottom=False)
-    noises = [run.truth_noise for run in runs if run.truth is not None and not run.truth_is_exact]
+    measured = [run for run in runs if run.truth is not None and not run.truth_is_exact]
     title = "Online error since the start (solid), claimed σ (dashed)"
-    if noises:
-        exact = all(noise == TruthNoise() for noise in noises)
-        title += "\nthe truth counts as exact" if exact else "\nσ with that of the truth; grey: the truth is doubtful"
+    if measured:
+        exact = all(run.truth_noise == TruthNoise() for run in measured)
+        title += "\nthe truth counts as exact" if exact else "\nσ with that of the truth (dotted)"
+    if known and any(len(time) < len(run.online) for run, (time, *_) in zip(runs, series)):
+        title += "; grey: the truth is doubtful"
     if any(run.summary.get("truth_doubt") for run in runs):
         title += "\nthe true path and the estimated one do not fit"
     axes[0].set_title(title if known else "Claimed σ of the online pose; no true path is known")

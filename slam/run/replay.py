@@ -16,7 +16,7 @@ from slam.geometry.rig import MINIMAL_POINTS, measurement_rows
 from slam.input.features import Rectification
 from slam.interfaces import Backend, RevisingBackend
 from slam.run.recording import RecordedFrame, Recording
-from slam.third_party import checked, named_failures, recent_of
+from slam.third_party import OnlinePose, checked, named_failures, recent_of
 from slam.tracks.config import AssociationConfig
 from slam.window.consensus import find_consensus
 
@@ -46,10 +46,10 @@ def replay(
     """
     config, inside = association or AssociationConfig(), Rectification(recording.rig)
     inside.require_fits(backend)
-    threshold, size = config.consistency_sigmas * inside.models(recording.models).pixel_sigma, 0
+    sigma, size, path = inside.models(recording.models).pixel_sigma, 0, list[OnlinePose]()
     for k, frame in enumerate(recording):
         with named_failures(f"frame {frame.number}", backend):
-            result = _step(inside, backend, k, frame, size, threshold, config.hypotheses)
+            result = _step(inside, backend, k, frame, size, sigma, config, path)
         size = result.map_size
         yield result
 
@@ -66,9 +66,10 @@ def _status(report: UpdateReport, begins: bool) -> tuple[FrameStatus, str]:
 
 
 def _step(
-    inside: Rectification, backend: Backend, k: int, frame: RecordedFrame, size: int, threshold: float, hypotheses: int
-) -> FrameResult:
-    """One frame, before which there are so many landmarks (`size`) in the map."""
+    inside: Rectification, backend: Backend, k: int, frame: RecordedFrame, size: int, sigma: float,
+    config: AssociationConfig, path: list[OnlinePose],
+) -> FrameResult:  # fmt: skip
+    """One frame, before which there are so many landmarks (`size`) in the map; the last poses are in `path`."""
     times, guess = [time.perf_counter()], None
     seen, added = inside.observations_in(frame.observed), inside.observations_in(frame.added)
     if frame.revision is not None and isinstance(backend, RevisingBackend):
@@ -78,7 +79,10 @@ def _step(
     if len(seen):
         points, measured = backend.positions(seen.ids), measurement_rows(seen.uv_left, seen.uv_right)
         expected = prediction.T_world_left
-        guess = find_consensus(inside.rig, points, measured, expected, threshold, hypotheses, seed=k).T_world_left
+        threshold = config.consistency_sigmas * sigma
+        guess = find_consensus(
+            inside.rig, points, measured, expected, threshold, config.hypotheses, seed=k
+        ).T_world_left
     times.append(time.perf_counter())
     report = checked(backend, "update", backend.update(seen, guess))
     times.append(time.perf_counter())
@@ -91,7 +95,9 @@ def _step(
         backend.remove(frame.removed[at_once])
     times.append(time.perf_counter())
     estimate = checked(backend, "estimate", backend.estimate(landmarks=False))
-    recent = recent_of(backend, FRAMES + 1)
+    used = seen.select(np.isin(seen.ids, report.used))
+    path[:] = *path[-FRAMES:], OnlinePose.seen(inside.rig, sigma, estimate, used)
+    recent = recent_of(backend, path)
     times.append(time.perf_counter())
     status, reason = _status(report, begins=not size and len(added) > 0)
     count, every = len(seen), len(seen) + len(frame.added)

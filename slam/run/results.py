@@ -96,7 +96,6 @@ METRICS = (
     Metric("segment_percent", "online drift by distance (RPE)", "%", "accuracy/online/segment error [%]", "lower",
            "compared run"),
     Metric("sigma_m", "claimed σ of the last position", "mm", "final_sigma_m", shown="run picture brief"),
-    Metric("ratio", "errors / claimed σ (1 is right)", shown="run"),
     Metric("ratio_10m", "errors / claimed σ over 10 m (1 is right)", "", "consistency/NEES over 10 m", "one",
            "compared main"),
     Metric("ratio_1m", "errors / claimed σ over 1 m (1 is right)", "", "consistency/NEES over 1 m", "one"),
@@ -151,8 +150,6 @@ def figures(summary: Mapping[str, Any]) -> dict[str, float]:
         found["tracked"] = _measured(summary) / frames
     followed = bool((summary.get("status") or {}).get("tracked"))
     found[DOUBTED] = float(bool(summary.get("doubt")) or (frames > 1 and not followed))
-    if ratios := _ratios(found):
-        found["ratio"] = next(iter(ratios.values()))
     if not followed:  # poses that are the motion model's have no loops, path or σ
         found = {key: value for key, value in found.items() if key not in _OF_A_PATH}
     if not found.get("loops_closed") and not found.get("loops_refused"):
@@ -170,10 +167,12 @@ def rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, list[str
     if any(truths := [errors_of_truth(summary) for summary in summaries]):
         yield "errors of the true path itself", [text or "–" for text in truths]
     found = list(map(figures, summaries))
+    judged = {key for one in found for key in list(_ratios(one))[:1]}
     for metric in METRICS:
-        values = [one.get(metric.key, np.nan) for one in found]
-        if "run" in metric.shown and any(value > _LEAST.get(metric.key, -1.0) for value in values):
-            yield metric.title, list(map(metric.show, values))
+        if "run" in metric.shown or metric.key in judged:
+            values = [one.get(metric.key, np.nan) for one in found]
+            if any(value > _LEAST.get(metric.key, -1.0) for value in values):
+                yield metric.title, list(map(metric.show, values))
 
 
 def facts(summary: Mapping[str, Any], brief: bool = False) -> str:
@@ -217,8 +216,8 @@ def _at(tree: Any, place: str, default: Any = None) -> Any:
 
 
 def _ratios(found: Mapping[str, float]) -> dict[str, float]:
-    """How many times as large as claimed errors are, and over what; the one to judge by first."""
-    return {over: found[key] for key, over in RATIOS.items() if np.isfinite(found.get(key, np.nan))}
+    """How many times as large as claimed errors are, by key; the one to judge by first."""
+    return {key: found[key] for key in RATIOS if np.isfinite(found.get(key, np.nan))}
 
 
 def verdict(found: Mapping[str, float], runs: int = 1) -> str:
@@ -228,7 +227,7 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     even if all frames of a run are as good as one, which errors of the rig make them.
     """
     low, high = (np.sqrt(bound / 6) for bound in chi_square_band(6, max(runs, 1)))
-    ratios = _ratios(found)
+    ratios = {RATIOS[key]: ratio for key, ratio in _ratios(found).items()}
     if not ratios:
         return ""
     said = {over: "too small" if r > high else "too large" if r < low else "right" for over, r in ratios.items()}
@@ -241,14 +240,18 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     of = "runs" if runs == 1 else f"means of {runs} runs"
     times = "as large as" if number(ratio) == "1" else f"{number(ratio)} times what"
     times = f"{judged} errors of the pose are {times} they claim"
-    band = f"({low:.2f} to {high:.2f} in 95 % of {of})"
+    parts = [f"{times} ({low:.2f} to {high:.2f} in 95 % of {of})"]
     if (share := found.get(f"truth {judged}", 0.0)) > _MOSTLY:
-        others.append(f"{100 * share:.0f} % of the error that is expected {judged} is the true path's own")
+        own = f"{100 * share:.0f} % of the error that is expected {judged} is the true path's own"
+        if said[judged] == "too small":  # whoever has them, errors are larger than both together explain
+            parts.append(own)
+        else:
+            word, parts = "can hardly be judged", [own, *parts]
     if exact:
         others.append("they count errors of the calibration, and this world's cameras have none")
     if found.get("pixels_alone"):
         others.append("they count pixel noise alone, and no errors of the calibration")
-    return "; ".join([f"covariances {word}: {times} {band}", *others])
+    return f"covariances {word}: {'; '.join([*parts, *others])}"
 
 
 def verdict_of_run(summary: Mapping[str, Any]) -> str:

@@ -160,16 +160,16 @@ def place_of_truth(run: RunData) -> Array:
     return T
 
 
-def pose_errors(run: RunData) -> tuple[Array, Array, Array]:
-    """Time since the start (N,) [s], errors of the online pose and their standard deviations, (N, 2) each.
+def pose_errors(run: RunData) -> tuple[Array, Array, Array, Array]:
+    """Time since the start (N,) [s], and of the online pose errors, the σ that is claimed, and the expected one.
 
-    The columns are the distance from the true position [m], see `place_of_truth`, and the angle of the rotation's error
-    [deg]. Without a truth the errors are zero. Standard deviations are those of all axes together, that the back end
-    claims and that of the truth, as the NEES from the start has them.
+    Of these (N, 2) the columns are the distance from the true position [m], see `place_of_truth`, and the angle of the
+    rotation's error [deg]. Without a truth the errors are zero. A σ is that of all axes together; the expected one has
+    that of the truth, too, as the NEES from the start has it.
     """
     if run.truth is None:
         stamps = run.online.stamps
-        return stamps - stamps[0], np.zeros((len(stamps), 2)), run.deviations
+        return stamps - stamps[0], np.zeros((len(stamps), 2)), run.deviations, run.deviations
     own, true = _paired(run)
     off = np.linalg.norm(own.positions - transform(place_of_truth(run), true.positions), axis=1)
     turned = np.linalg.norm(rotation_errors(own, true, 0.0 if run.truth_is_exact else _TURNED), axis=1)
@@ -181,7 +181,7 @@ def pose_errors(run: RunData) -> tuple[Array, Array, Array]:
     of_truth = np.column_stack([np.trace(P[:, i : i + 3, i : i + 3], axis1=1, axis2=2) for i in (3, 0)])
     claimed = run.deviations[np.searchsorted(run.online.stamps, own.stamps)]
     sigma = np.sqrt(claimed**2 + np.maximum(of_truth, 0.0) * [1, np.degrees(1) ** 2])
-    return own.stamps - run.online.stamps[0], np.column_stack([off, np.degrees(turned)]), sigma
+    return own.stamps - run.online.stamps[0], np.column_stack([off, np.degrees(turned)]), claimed, sigma
 
 
 def well_known(run: RunData) -> np.ndarray:

@@ -65,7 +65,7 @@ def run(
         on_frame: called after every frame, for a progress display.
         frontend: used in place of the one that the options name.
         watches: called after every step with its images, its result and the system, to show or to draw it.
-        until: ends a live run when it is set, as if there were no more frames.
+        until: ends the run when it is set, after the present frame, as if there were no more.
         record: gathers what the run gives, for whom the files are not enough.
 
     Raises:
@@ -95,7 +95,7 @@ def run(
     )
     if live is not None:  # before its clock starts, with its first frame
         warm_up(options.backend if options.backend in registry.ONLINE else registry.ONLINE[0], until=until)
-    way = _Run(sequence, options, system, record or RunRecord(), live)
+    way = _Run(sequence, options, system, record or RunRecord(), until or threading.Event(), live)
     return way.drive(way.processed(frames, tuple(watches)), on_frame)
 
 
@@ -105,6 +105,7 @@ def run_recording(
     options: RunOptions,
     on_frame: Callable[[FrameResult], None] | None = None,
     record: RunRecord | None = None,
+    until: threading.Event | None = None,
 ) -> dict[str, Any]:
     """Replay a recording through a back end; leaves the files of a run and returns its summary.
 
@@ -114,7 +115,8 @@ def run_recording(
     models = inside.models(config.models)
     backend = registry.create("backends", options.backend, inside.rig, models=models, **config.backend)
     results = zip((f.number for f in recording), replay(recording, backend, association=config.association))
-    return _Run(recording, options, Replayed(recording, backend), record or RunRecord()).drive(results, on_frame)
+    way = _Run(recording, options, Replayed(recording, backend), record or RunRecord(), until or threading.Event())
+    return way.drive(results, on_frame)
 
 
 @dataclass(eq=False)
@@ -125,6 +127,7 @@ class _Run:
     options: RunOptions
     system: StereoSlam | Replayed
     record: RunRecord
+    until: threading.Event
     live: LiveFrames | None = None
     tape: list[RecordedFrame] = field(default_factory=list)
     failures: list[Exception] = field(default_factory=list)  # of the last files
@@ -185,11 +188,13 @@ class _Run:
                         self.tape.append(RecordedFrame.of(result, number))
                     if on_frame is not None:
                         on_frame(result)
+                    if self.until.is_set():
+                        break
             except BaseException as error:
                 ended, stopped_by = f"stopped: {_said(error)}", error
                 raise
             finally:
-                if self.live is not None and self.live.ended_early and stopped_by is None:
+                if self.until.is_set() and stopped_by is None:
                     ended = "ended by the user"
                 summary = names | {"ended": ended} | self._tracking()
                 self._write_last(files, summary, score)

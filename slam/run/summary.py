@@ -106,7 +106,9 @@ class Replayed:
     def trajectory(self) -> Trajectory:
         """The back end's final estimate of every frame's pose."""
         with named_failures("the path", self.backend):
-            return Rectification(self.recording.rig).path_out(self.backend.trajectory())
+            return Rectification(self.recording.rig).path_out(
+                checked(self.backend, "trajectory", self.backend.trajectory())
+            )
 
     def estimate(self) -> Estimate:
         """Pose and map with covariances."""

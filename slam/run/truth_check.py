@@ -3,7 +3,8 @@
 Compared are motions over about a second, in which drift hardly counts: ``A`` of the estimated path and ``B`` of the
 true one. A true path of another body, at the constant pose X in the left camera, in another unit (s to a metre) and of
 another clock has ``B = X⁻¹ A X``, positions times s, at stamps that are a shift later. All three are fitted, for the
-file as it is read, with quaternions as w x y z, and with inverse poses. What the fit cannot do without is named.
+file as it is read, with quaternions as w x y z, and with inverse poses. What the fit cannot do without is named. Where
+motions differ by little, which an error of the cameras' calibration may explain, only another clock is looked for.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ _TURN = 0.05  # [rad] of a motion: turns that are less are compared with it
 _ROWS = 400  # poses that are looked at
 _EXPLAINS = 2.5  # times smaller errors become by a mistake that is named
 _LATEST, _STEP = 2.0, 0.05  # [s] of the shifts that are tried
-_FINE = 0.01  # errors of motions, as a share of them, below which nothing is looked for
+_APART_AT_LEAST = 5  # guard: motions one after the other, of which a shift cannot explain most by chance
+_FINE = 0.01  # errors of motions, as a share of them, below which nothing but a shift is looked for
 _MISFIT = 0.3  # errors of motions, as a share of them, that are no drift
 _APART = 0.8  # the same, that no noise of an estimated path explains
 _ALIKE = 0.05  # errors of positions, as a share of the path, that are drift
@@ -65,8 +67,6 @@ def truth_doubt(own: Trajectory, truth: Trajectory, noise: TruthNoise = _EXACT) 
     if given is None:
         return ""
     known = _POSES * np.hypot(noise.translation / given.size, noise.rotation / given.turning)
-    if given.error < _EXPLAINS * max(_FINE, known):  # errors are no less than _FINE
-        return ""
     w_first = quaternion(truth.poses[:, :3, :3])[:, [1, 2, 3, 0]]
     as_w_first = pose(rotation_from_quaternion(w_first), truth.positions)
     poses = {
@@ -74,17 +74,22 @@ def truth_doubt(own: Trajectory, truth: Trajectory, noise: TruthNoise = _EXACT) 
         "its quaternions are w x y z, and must be x y z w": as_w_first,
         "its poses are inverse, and must be those of the camera in the world": inverse(truth.poses),
     }
+    floor, frees = _FINE, ["", "scale", "body", "scale body"]
+    if given.error < _EXPLAINS * max(_FINE, known):  # that may be the calibration's; a clock is none of it
+        if np.ptp(own.stamps) < _APART_AT_LEAST * _SECONDS:
+            return ""
+        floor, frees, poses = 0.0, [""], {"": truth.poses}
     tried = []
     for said, read in poses.items():
         reading = Trajectory(truth.stamps, read)
-        for at in (0.0, _shift(own, reading)):
-            for free in ("", "scale", "body", "scale body"):
+        for at in (0.0, _shift(own, reading, frees[-1])):
+            for free in frees:
                 mistakes = bool(said) + bool(at) + len(free.split())
                 if (fit := _fit(own, reading, at, free)) is not None:
-                    tried.append((fit.error * _EXPLAINS**mistakes, mistakes, fit, said, at, free))
+                    tried.append((max(floor, fit.error) * _EXPLAINS**mistakes, mistakes, fit, said, at, free))
     _, mistakes, best, said, shift, free = min(tried, key=lambda one: one[:2])
     if not mistakes or best.error > _MISFIT:
-        return _unexplained(own, truth, given.error)
+        return _unexplained(own, truth, given.error) if floor else ""
     causes = [said] if said else []
     if shift:
         causes.append(f"its times are {abs(shift):.2f} s too {'late' if shift > 0 else 'early'}")
@@ -109,7 +114,7 @@ def truth_doubt(own: Trajectory, truth: Trajectory, noise: TruthNoise = _EXACT) 
 
 def _unexplained(own: Trajectory, truth: Trajectory, error: float) -> str:
     """What to say where no mistake explains why motions differ: of rotations alone, where positions agree."""
-    pairs = associate(own, truth)
+    pairs = _pairs(own, truth)
     extent = float(np.sqrt(3 * pairs[1].positions.var(axis=0).mean()))
     if error < _APART or absolute_errors(*pairs).rmse > _ALIKE * extent:
         return ""
@@ -119,22 +124,22 @@ def _unexplained(own: Trajectory, truth: Trajectory, error: float) -> str:
     )
 
 
-def _shift(own: Trajectory, truth: Trajectory) -> float:
-    """The shift [s] by which the truth's stamps are late, if the best fit of all is right."""
-    best, shift = _fit(own, truth, 0.0) or _Fit(np.inf, 1.0, 0.0, 0.0, 0), 0.0
+def _shift(own: Trajectory, truth: Trajectory, free: str) -> float:
+    """The shift [s] by which the truth's stamps are late, if the best fit of what is `free` is right."""
+    best, shift = _fit(own, truth, 0.0, free) or _Fit(np.inf, 1.0, 0.0, 0.0, 0), 0.0
     half = best.motions / 2
-    for step, reach in ((_STEP, _LATEST), (_STEP / 10, _STEP)):
+    for step, reach in ((_STEP, _LATEST if free else 5 * _STEP), (_STEP / 10, _STEP)):
         for at in shift + np.arange(-reach, reach + step / 2, step):
-            fit = _fit(own, truth, float(at))
+            fit = _fit(own, truth, float(at), free)
             if fit is not None and fit.error < best.error and fit.motions > half:
                 best, shift = fit, float(at)
     return shift
 
 
-def _fit(own: Trajectory, truth: Trajectory, shift: float, free: str = "scale body") -> _Fit | None:
+def _fit(own: Trajectory, truth: Trajectory, shift: float, free: str) -> _Fit | None:
     """The fit of what is `free`; None where too little is known, or the camera hardly moves."""
     try:
-        P, Q = associate(Trajectory(own.stamps + shift, own.poses), truth)
+        P, Q = _pairs(Trajectory(own.stamps + shift, own.poses), truth)
     except TrajectoryError:
         return None
     if len(P) <= _LEAST:
@@ -157,9 +162,14 @@ def _fit(own: Trajectory, truth: Trajectory, shift: float, free: str = "scale bo
             R = nearest_rotation((ta + J @ lever).T @ tb / (scale * size**2) + wa.T @ wb / turn**2)
             lever = np.linalg.solve(rows.T @ rows + prior, rows.T @ (tb @ R.T / scale - ta).ravel())
     off_t, off_w = tb @ R.T / scale - ta - J @ lever, wb @ R.T - wa
-    error = max(_FINE, float(np.hypot(_rms(off_t) / size, _rms(off_w) / turn)))
+    error = float(np.hypot(_rms(off_t) / size, _rms(off_w) / turn))
     turned = float(np.degrees(np.linalg.norm(so3_log(R))))
     return _Fit(error, scale, turned, float(np.linalg.norm(lever)), len(A), size, turn)
+
+
+def _pairs(own: Trajectory, truth: Trajectory) -> tuple[Trajectory, Trajectory]:
+    """`associate`, also between true poses as far apart as most are: else a shift would choose among the poses."""
+    return associate(own, truth, max(0.02, float(np.median(np.diff(truth.stamps))) if len(truth) > 1 else 0.0))
 
 
 def _rms(vectors: Array) -> float:

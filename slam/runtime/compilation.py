@@ -216,8 +216,8 @@ def _helper(compiler: type[Compiler] = _Helper, **options: Any) -> Callable[[Cal
 helper = _helper()
 #: Sums may be reordered, so that loops run on vector registers; always the same way, whatever the number of threads.
 vector_helper = _helper(fastmath=True)
-#: The same for loops over so many arrays that looking for shared memory would keep them from vector registers.
-disjoint_vector_helper = _helper(_Disjoint, fastmath=True)
+#: For loops over so many arrays that looking for shared memory would keep them from vector registers.
+disjoint_helper, disjoint_vector_helper = _helper(_Disjoint), _helper(_Disjoint, fastmath=True)
 
 
 def kernel(function: Callable[..., Any]) -> Any:

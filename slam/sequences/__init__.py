@@ -17,22 +17,16 @@ from urllib.parse import quote
 import numpy as np
 
 from slam import registry
-from slam.errors import (
-    ConfigurationError,
-    PartError,
-    SequenceError,
-    SlamError,
-    UnknownNameError,
-    cause,
-)
+from slam.errors import ConfigurationError, PartError, SequenceError, SlamError, UnknownNameError, cause
 from slam.files import expanded, note_input, reason
-from slam.geometry.se3 import Array
+from slam.geometry.rig import quarter_turn
+from slam.geometry.se3 import Array, pose
 from slam.geometry.stamps import pair
 from slam.geometry.trajectory import Trajectory
 from slam.naming import nearest, unknown
 from slam.query import read_query
 from slam.sequences import euroc, folders, kitti, ros
-from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, logger, read_masks, turned
+from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, logger, read_masks
 from slam.sequences.folders import VIDEO_SUFFIXES
 from slam.sequences.images import IMAGE_SUFFIXES
 from slam.sequences.options import RECORDED, Options, truth_noise
@@ -130,7 +124,9 @@ def _open_folder(text: str, format: str | None, quiet: bool) -> RecordedSequence
         options.require_read(f"{folder} is read as {name}")
     for line in () if quiet else lines:
         logger.warning("%s", line)
-    truth = turned(found.ground_truth, found.rig)
+    truth, turns = found.ground_truth, found.rig.turns
+    if truth is not None and turns:  # of the camera that is turned as the rig is
+        truth = Trajectory(truth.stamps, truth.poses @ pose(quarter_turn(-turns), np.zeros(3)))
     return replace(found, ground_truth=truth, masks=masks, swap=swap, warnings=lines)
 
 

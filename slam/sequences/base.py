@@ -15,8 +15,8 @@ import numpy as np
 from slam.data import StereoFrame
 from slam.errors import ConfigurationError, SequenceError, one_line
 from slam.files import expanded
-from slam.geometry.rig import StereoRig, quarter_turn
-from slam.geometry.se3 import Array, pose
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range, require_frame
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.naming import sequence_line
@@ -191,13 +191,6 @@ class RecordedSequence:
                     right = None
                 if left is not None:
                     yield as_used(index, float(self.stamps[index]), left, right, self.rig, self.masks)
-
-
-def turned(truth: Trajectory | None, rig: StereoRig) -> Trajectory | None:
-    """The path of the left camera as recorded as that of the camera that is turned as the rig is."""
-    if truth is None or not rig.turns:
-        return truth
-    return Trajectory(truth.stamps, truth.poses @ pose(quarter_turn(-rig.turns), np.zeros(3)))
 
 
 def as_used(

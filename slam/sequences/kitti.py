@@ -19,9 +19,9 @@ from slam.sequences.base import FaultLog, RecordedSequence
 from slam.sequences.calibration import array, naming, read_kitti
 from slam.sequences.names import stem
 from slam.sequences.options import Options
-from slam.sequences.pairs import Times, image_names, listed, open_images, told_times
+from slam.sequences.pairs import image_names, listed, open_images, told_times
 from slam.sequences.rigs import calibration_files, projection_offset, read_rig, rigid
-from slam.sequences.tables import date_time, numbers, read_rows, require_truth
+from slam.sequences.tables import Times, date_time, numbers, read_rows, require_truth
 
 #: The data sheet of KITTI's GPS/IMU unit (OXTS RT 3003, with RTK corrections): 2 cm, 0.03° in roll and pitch, and 0.1°
 #: in heading, which changes slowly. That, and how the camera stands to the unit, is left to be found.

@@ -29,7 +29,6 @@ class LiveFrames:
 
     Attributes:
         dropped: number of frames that were replaced by a newer one before they were taken.
-        ended_early: whether it was ended by `until` before the last frame.
 
     Examples:
         >>> import slam
@@ -47,7 +46,6 @@ class LiveFrames:
         self, frames: Sequence | Iterable[StereoFrame], paced: bool | None = None, until: threading.Event | None = None
     ) -> None:
         self.dropped = 0
-        self.ended_early = False
         self._frames = frames
         self._paced = not is_live(frames) if paced is None else paced
         self._until = until or threading.Event()  # only read: it is the caller's
@@ -87,8 +85,7 @@ class LiveFrames:
             while self._newest is None and not self._over and not self._until.is_set():
                 self._changed.wait(_LOOK)
             newest, self._newest = self._newest, None
-            self.ended_early = self._until.is_set()
-            if newest is None or self.ended_early:
+            if newest is None or self._until.is_set():
                 return None
             self._arrivals.append((newest[0].index, newest[1]))
             return newest[0]

@@ -19,7 +19,7 @@ from slam.sequences.base import Decoder, FaultLog, Images, attempt
 from slam.sequences.images import IMAGE_SUFFIXES, Size, both, read_image, require_same_size
 from slam.sequences.names import Keys, keys_of, natural, odd_ones, stem
 from slam.sequences.options import WIDEST_TOLERANCE, Options
-from slam.sequences.tables import read_times
+from slam.sequences.tables import Times, read_times
 
 #: Frames per second of images that say nothing of time.
 RATE = 10.0
@@ -50,14 +50,6 @@ class Pairs(NamedTuple):
     keys: IntArray  # the left images' (N,)
     rows: IntArray  # of each listing (N, 1 or 2), -1 where there is no right image
     stamps: Array  # times (N,) [s], strictly increasing
-
-
-class Times(NamedTuple):
-    """A file of times."""
-
-    path: Path
-    rows: Array  # times by row [s], NaN for unreadable ones
-    names: list[str]  # of the images by row, where the file has them
 
 
 def open_images(
@@ -156,7 +148,7 @@ def told_times(folder: Path, options: Options, faults: FaultLog, *usual: Path) -
     elif "fps" in options:
         usual = ()
     path = next((path for path in usual if path.is_file() or "times" in options), None)
-    return None if path is None else Times(path, *read_times(path, faults))
+    return None if path is None else read_times(path, faults)
 
 
 def pair_up(

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -55,8 +55,16 @@ def read_rows(path: Path, parse: Callable[[str], T], faults: FaultLog) -> list[T
     return rows
 
 
-def read_times(path: Path, faults: FaultLog) -> tuple[Array, list[str]]:
-    """The times in a file by row [s], NaN for unreadable ones, and the images that its rows name, if all do.
+class Times(NamedTuple):
+    """A file of times."""
+
+    path: Path
+    rows: Array  # times by row [s], NaN for unreadable ones
+    names: list[str]  # of the images by row, where all rows name one
+
+
+def read_times(path: Path, faults: FaultLog) -> Times:
+    """The times in a file.
 
     A row's time is its first number, or a date with the time; the second number where the first ones count rows. Times
     in a finer unit are known by their steps. SequenceError where a time is impossible.
@@ -81,7 +89,7 @@ def read_times(path: Path, faults: FaultLog) -> tuple[Array, list[str]]:
         times = times / size
     if (np.abs(times) > _MOST_SECONDS).any():
         raise SequenceError(f"{path}: {times[np.abs(times) > _MOST_SECONDS][0]:g} is no possible time in seconds")
-    return np.asarray(times), names if len(set(names)) == len(rows) else []
+    return Times(path, np.asarray(times), names if len(set(names)) == len(rows) else [])
 
 
 def _numbers_in(text: str) -> list[float]:

@@ -24,6 +24,7 @@ from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array, inverse, log
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
+from slam.third_party import OnlinePose
 from slam.tracks.standing import Standing
 from slam.tracks.table import Tracks
 
@@ -166,7 +167,8 @@ class Step:
     suspects: IdArray = field(default_factory=_NONE.copy)  # ids of landmarks that may move
     report: UpdateReport = field(default_factory=lambda: UpdateReport.nothing(UpdateStatus.EMPTY, ""))  # of the update
     estimate: Estimate = _NOWHERE  # the camera's pose after the update
-    recent: RecentPoses | None = None  # the last poses by the back end, if it tells how their errors hang together
+    recent: RecentPoses | None = None  # the last poses by the back end, and how their errors hang together
+    online: tuple[OnlinePose, ...] = ()  # the same as each was estimated in its time
     labels: MotionLabels = field(default_factory=lambda: MotionLabels(_NONE, _NONE, _NONE))  # which features move
     objects: tuple[MovingObject, ...] = ()  # the moving bodies
     added: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)  # landmarks that joined the map

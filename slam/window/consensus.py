@@ -58,10 +58,8 @@ def find_consensus(
     if nearer.inliers.sum() >= max(clear, float(first.inliers.sum())):
         return nearer
     hypothesis = matches.best_hypothesis(hypotheses, seed)
-    if hypothesis is None:
-        return first
-    best = matches.polished(hypothesis)
-    return best if best.inliers.sum() > first.inliers.sum() else first
+    found = [first, nearer] if hypothesis is None else [first, nearer, matches.polished(hypothesis)]
+    return max(found, key=lambda one: one.inliers.sum())
 
 
 def landmarks_pose(measure: RectifiedMeasurement, points: Array, z: Array, T: Array, seed: int) -> Array | None:

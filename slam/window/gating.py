@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import bdtrc, comb, gammainc
+from scipy.special import bdtrc, comb, gammainc, gammaincinv
 
 from slam.chi_square import chi_square_limit
 from slam.geometry import kernels
+from slam.geometry.arrays import BoolArray
 from slam.geometry.se3 import Array
 
 MIN_OBSERVATIONS = 6  #: fewest observations whose agreement is tested
@@ -15,21 +16,34 @@ MIN_CONSENSUS = 5  #: fewest observations that agree on a pose by more than chan
 INFLATION = (3.0, 10.0)  #: factors on the process noise's standard deviation tried if observations disagree
 
 
-def by_chance(rejected: Array, agree: int, count: int, limit: float, probability: float, fitted: int = 0) -> bool:
-    """Whether as many of `count` wrong observations may pass a gate as agree, at the gate's own level.
+def by_chance(z: Array, used: BoolArray, distances: Array, probability: float, fitted: int = 0) -> bool:
+    """Whether as many wrong observations may pass a gate as agree with a prediction, at the gate's own level.
 
-    The gate has a `limit` for squared distances, χ² with three degrees of freedom, and a `probability`. Those of the
-    observations that it `rejected` (R,) show how widely wrong ones scatter about their predictions; without any: True.
+    Of the observations z (M, 3), NaN where a component is not measured, those `used` (M,) agree. The squared distances
+    (M,) of those beyond the gate show how widely wrong ones scatter about their predictions; without any: True.
     `fitted` observations agree with the pose that was made to fit them, whatever they are, and it may have been made to
     fit any so many: the number of others that agree is tested for all such choices together (an a contrario test, as in
     Moisan & Stival, IJCV 2004).
     """
+    dof, agree = int(np.isfinite(z).sum(axis=1).max()), int(used.sum())
+    rejected = distances[~used & np.isfinite(distances) & (distances > chi_square_limit(dof, probability))]
     if not len(rejected) or agree <= fitted:
         return True
-    spread = float(np.median(rejected)) / chi_square_limit(3, 0.5)  # in units of the innovation covariances
-    share = gammainc(1.5, limit / spread / 2)
-    others = bdtrc(agree - fitted - 1, count - fitted, share)
-    return bool(comb(count, fitted) * others > 1 - probability)
+    share = _passing(rejected, dof, probability)
+    others = bdtrc(agree - fitted - 1, len(z) - fitted, share)
+    return bool(comb(len(z), fitted) * others > 1 - probability)
+
+
+def _passing(rejected: Array, dof: int, probability: float) -> float:
+    """Share of wrong observations that pass the gate, whose squared distances are a scaled χ², by those that do not.
+
+    Their median is that of what lies beyond the limit: ``median = scale · quantile((1 + share) / 2)``.
+    """
+    limit, middle, share = chi_square_limit(dof, probability), float(np.median(rejected)), 0.0
+    for _ in range(50):  # 50: steps of a fixed point that only rises
+        scale = middle / (2 * gammaincinv(dof / 2, (1 + share) / 2))
+        share = float(gammainc(dof / 2, limit / scale / 2))
+    return share
 
 
 def squared_distances(residuals: Array, covariances: Array) -> Array:

@@ -58,7 +58,8 @@ def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, cont
     contradicted = 0 if found is None else contradicted + 1
     if found is not None and (found.jump is None or contradicted >= _LASTING):
         return found
-    if len(used) >= MIN_OBSERVATIONS and ONE_AGREES_IN * used.sum() < len(used) and _by_chance(problem, T, used):
+    few = len(used) >= MIN_OBSERVATIONS and ONE_AGREES_IN * used.sum() < len(used)
+    if few and by_chance(problem.z, used, problem.distances(T), problem.probability, MINIMAL_POINTS):
         used = np.zeros_like(used)
     return Agreement(T, used, None, contradicted)
 
@@ -81,13 +82,6 @@ def _seated(problem: pose_only.PoseProblem, there: Array) -> Agreement | None:
         problem = changed(problem, information=np.linalg.inv(wide))
     T, used = pose_only.solve(problem, there)
     return Agreement(T, used, jump) if used.sum() >= max(MIN_CONSENSUS, (len(used) + 1) // 2) else None
-
-
-def _by_chance(problem: pose_only.PoseProblem, T: Array, used: BoolArray) -> bool:
-    """Whether as many may agree by chance with a pose that was made to fit three of them."""
-    distances, limit = problem.distances(T), chi_square_limit(3, problem.probability)
-    rejected = distances[~used & np.isfinite(distances)]
-    return by_chance(rejected, int(used.sum()), len(used), limit, problem.probability, MINIMAL_POINTS)
 
 
 def world_covariance(P: Array) -> Array:

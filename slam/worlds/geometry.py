@@ -202,10 +202,6 @@ class Landmarks(Table):
     size: Array = field(repr=False)  # diameter of what is painted there (P,) [m]
     looks: IdArray = field(repr=False)  # which landmark it looks like, usually itself (P,)
 
-    def world_positions(self, T_world_body: Array) -> Array:
-        """Positions (P, 3) in the world, for body poses (B + 1, 4, 4) whose row 0 is the identity."""
-        return turned(self.positions, self.object, T_world_body) + T_world_body[self.object, :3, 3]
-
 
 def place_landmarks(
     rectangles: Iterable[Rectangle], density: float, rng: np.random.Generator, alike: bool = False

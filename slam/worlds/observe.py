@@ -62,7 +62,7 @@ def visible_landmarks(world: World, frame: int) -> VisibleLandmarks:
     bodies = world.T_world_body(frame)
     near = world.near(world.landmarks.positions, 0.0, world.landmarks.object, frame)
     landmarks = world.landmarks.select(near)
-    positions = landmarks.world_positions(bodies)
+    positions = turned(landmarks.positions, landmarks.object, bodies) + bodies[landmarks.object, :3, 3]
     points = (positions - T[:3, 3]) @ T[:3, :3]
     (nearest, farthest), camera, (x, y, z) = world.reach, world.rig.left, points.T
     widest = 1.3 * max(camera.u0, camera.width - camera.u0) / camera.fu

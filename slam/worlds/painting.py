@@ -39,13 +39,6 @@ def _paint_material(piece: Material, density: float) -> np.ndarray:
     return page.picture
 
 
-def _frame(page: Page, edge: float, colour: Colour) -> None:
-    """A frame around the whole page, `edge` texels wide."""
-    w, h = page.width, page.height
-    for box in ((0, 0, w, edge), (0, h - edge, w, edge), (0, 0, edge, h), (w - edge, 0, edge, h)):
-        page.bar(box, colour)
-
-
 def _cover(size: Size, rng: Rng, density: float) -> np.ndarray:
     colour = rng.uniform(30, 190, 3)
     page = Page(tinted(1 + 0.04 * rng.standard_normal(size, np.float32), colour), rng)
@@ -102,7 +95,9 @@ def _carton(size: Size, rng: Rng, density: float) -> np.ndarray:
         page.bar((x, label[1] + 0.1 * label[3], w, 0.4 * label[3]), (20.0, 20.0, 20.0))
         x += w + rng.uniform(0.015, 0.05) * label[2]
     page.print(page.part(0.08, 0.58, 0.84, 0.36, label), 0.12 * label[3], ink)
-    _frame(page, 1.5, (60.0, 90.0, 115.0))
+    w, h, edge = page.width, page.height, 1.5  # of a frame
+    for box in ((0, 0, w, edge), (0, h - edge, w, edge), (0, 0, edge, h), (w - edge, 0, edge, h)):
+        page.bar(box, (60.0, 90.0, 115.0))
     return page.picture
 
 

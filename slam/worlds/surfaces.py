@@ -119,10 +119,6 @@ class Bay:
     width: float  # [m]
     height: float  # [m]
 
-    def marks(self) -> Array:
-        """None: the whole wall has them."""
-        return np.zeros((0, 3))
-
 
 @dataclass(frozen=True, eq=False)
 class Books:

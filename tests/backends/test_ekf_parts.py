@@ -178,16 +178,16 @@ def test_a_correction_and_its_transport():
     rng = np.random.default_rng(10)
     covariance, P = advanced(*grown(rng), rng)
     m, kept = HEAD + 33, np.s_[12:HEAD]
-    V = 0.1 * rng.standard_normal((m, 5))
+    V, U = 0.1 * rng.standard_normal((m, 5)), 0.1 * rng.standard_normal((m, 2))
     J, K = np.eye(CAMERA), rng.standard_normal((11, 3, 6))
     J[:3, 3:6] = rng.standard_normal((3, 3))
     expected = P.copy()
-    expected[:m, :m] -= V @ V.T
+    expected[:m, :m] -= V @ V.T - U @ U.T
     expected[kept, kept] = P[kept, kept]
     T = np.eye(len(P))
     T[:CAMERA, :CAMERA] = J
     T[HEAD:m, :CAMERA] = K.reshape(-1, 6) @ J[:6]
-    found = covariance.corrected(V, np.zeros((5, 0)), J, K)
+    found = covariance.corrected(V, U, np.zeros((m, 0)), J, K)
     assert_equal_to_rounding(whole(found), T @ expected @ T.T)
 
 
@@ -223,7 +223,7 @@ def test_the_prediction_is_as_printed():
     s, _, _ = state_of(4, InverseDepth())
     camera, P, dt = s.camera.x + 0.1 * np.arange(12.0) / 12, dense(s.covariance), 0.25
     s = replace(s, camera=replace(s.camera, x=camera))
-    found = s.advanced(dt, predicted(s.camera, MODELS, P[:12, :12], dt, False))
+    found = s.advanced(dt, predicted(s.camera, MODELS, P[:12, :12], dt, False), np.arange(4), 0.0)
     A, W = np.eye(len(P)), np.zeros((len(P), 6))
     A[:6, 6:12] = dt * np.eye(6)
     W[:6], W[6:12] = dt * np.eye(6), np.eye(6)
@@ -256,7 +256,7 @@ def test_the_update_is_the_joseph_form(coordinates):
     assert np.abs(difference).max() < 1e-5  # what the differences leave in H
     found = np.concatenate([after.camera.x, after.landmarks.c.reshape(-1)])
     np.testing.assert_allclose(found, x + K @ nu, rtol=1e-6, atol=1e-6)
-    assert solution.w @ solution.w == pytest.approx(nu @ np.linalg.solve(S, nu), rel=1e-6)
+    assert solution.nis == pytest.approx(nu @ np.linalg.solve(S, nu), rel=1e-6)
 
 
 @pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
@@ -327,8 +327,7 @@ def test_the_iterated_update_is_the_maximum_of_the_posterior(spread, monkeypatch
     cost = lambda x: residuals(s, update, deviation * x)  # noqa: E731
     best = least_squares(cost, np.zeros(48), xtol=1e-12, ftol=1e-12, gtol=1e-12)
     np.testing.assert_allclose(corrected(s, update), deviation * best.x, atol=1e-5)
-    w = solution.w
-    assert w @ w == pytest.approx(2 * best.cost, rel=1e-3)  # νᵀS⁻¹ν there is the least cost
+    assert solution.nis == pytest.approx(2 * best.cost, rel=1e-3)  # νᵀS⁻¹ν there is the least cost
 
 
 def far_in_depth(seed: int) -> tuple[FilterState, Update, np.ndarray]:
@@ -372,7 +371,7 @@ def test_a_coordinate_at_its_limit_has_changed_by_so_much():
     at = replace(update, camera=replace(s.camera, transports=False)).linearised(None, asked)
     made = (InverseDepth().moved(s.landmarks.c, asked.reshape(-1, 3)) - s.landmarks.c).reshape(-1)
     assert made[2] > asked[2]
-    np.testing.assert_array_equal(at.change[12:], made)
+    np.testing.assert_array_equal(at.change[HEAD:], made)
     expected = (update.z - at.z + (at.own @ made.reshape(-1, 3, 1))[:, :, 0]).reshape(-1)
     np.testing.assert_allclose(at.nu, expected, atol=1e-9)
 
@@ -383,7 +382,23 @@ def test_a_distance_is_by_how_much_the_nis_falls_without_a_landmark():
     every = at.solved(whole)
     for gone in (0, 5, 11):
         without = at.solved(np.arange(12) != gone)
-        assert every.w @ every.w - without.w @ without.w == pytest.approx(every.distances()[gone], rel=1e-6)
+        assert every.nis - without.nis == pytest.approx(every.distances[gone], rel=1e-6)
+        assert without.distances[gone] == pytest.approx(every.distances[gone], rel=1e-6)
+
+
+def test_one_factor_serves_any_choice_of_landmarks():
+    """Against the formulas of S, ν and H of the used ones alone."""
+    _, update = far_off(1)
+    at, used, C = gate(update).at, np.arange(12) % 3 != 1, update.covariance.P
+    rows, solution = np.flatnonzero(np.repeat(used, 3)), at.solved(used)
+    S, HP, nu = at.S[np.ix_(rows, rows)], at.HP[rows], at.nu[rows]
+    np.testing.assert_allclose(solution.change, np.linalg.solve(S, HP).T @ nu, rtol=1e-8, atol=1e-12)
+    V, U, _ = solution.gain()
+    np.testing.assert_allclose(V @ V.T - U @ U.T, HP.T @ np.linalg.solve(S, HP), atol=1e-12 * np.abs(C).max())
+    cross = at.S[3:6, rows]  # landmark 1 is left out
+    off = at.nu[3:6] - cross @ np.linalg.solve(S, nu)
+    conditional = at.S[3:6, 3:6] - cross @ np.linalg.solve(S, cross.T)
+    assert solution.distances[1] == pytest.approx(off @ np.linalg.solve(conditional, off), rel=1e-6)
 
 
 @pytest.mark.parametrize("transports", [True, False])
@@ -415,20 +430,26 @@ def test_a_landmark_slides_across_its_line_of_sight_with_the_angle_of_view(coord
     density, rows, x = 0.01, np.array([0, 2]), s.camera.x.copy()
     x[0] += 0.5
     there = replace(s, camera=replace(s.camera, x=x))
-    found = there.slid(coordinates, rows, density)
     first, now = (s.landmarks.points - T[:3, 3] for T in (s.pose, there.pose))
-    distance = np.linalg.norm(now, axis=1)
-    angle = np.arccos(np.einsum("ni,ni->n", first, now) / distance / np.linalg.norm(first, axis=1))
-    added = dense(found.covariance) - dense(there.covariance)
-    for row in range(4):
-        at = slice(CAMERA + 3 * row, CAMERA + 3 * row + 3)
-        D = coordinates.jacobian(s.landmarks.anchors[row : row + 1], s.landmarks.c[row : row + 1])[0]
-        n = now[row] / distance[row]
-        across = density**2 * angle[row] * distance[row] ** 2 * (np.eye(3) - np.outer(n, n))
-        np.testing.assert_allclose(D @ added[at, at] @ D.T, across if row in rows else 0 * across, atol=1e-12)
-        added[at, at] = 0
-    assert not added.any()
-    assert found.slid(coordinates, rows, density) is found  # no more until it is seen from farther round
-    assert replace(found, camera=s.camera).slid(coordinates, rows, density).landmarks.turned.tolist() == (
-        found.landmarks.turned.tolist()
-    )
+    size, distance = np.linalg.norm(first, axis=1), np.linalg.norm(now, axis=1)
+    angle = np.arccos(np.einsum("ni,ni->n", first, now) / distance / size)
+    unknown = replace(there, landmarks=replace(there.landmarks, sights=np.full((4, 3), np.nan)))
+    found = at_rest(there, rows, density)
+    # no more until it is seen from elsewhere; on the way back it slides again
+    for before, after, sight, by in (
+        (there, found, now, angle), (found, at_rest(found, rows, density, 0.0, 1e-6), now, 0 * angle),
+        (found, at_rest(replace(found, camera=s.camera), rows, density), first, angle),
+        (unknown, at_rest(unknown, rows, density, 0.3), now, np.full(4, 0.3)),
+    ):  # fmt: skip
+        added = dense(after.covariance) - dense(before.covariance)
+        for row in range(4):
+            at = slice(CAMERA + 3 * row, CAMERA + 3 * row + 3)
+            D = coordinates.jacobian(s.landmarks.anchors[row : row + 1], s.landmarks.c[row : row + 1])[0]
+            across = density**2 * by[row] * ((sight[row] @ sight[row]) * np.eye(3) - np.outer(sight[row], sight[row]))
+            np.testing.assert_allclose(D @ added[at, at] @ D.T, across if row in rows else 0 * across, atol=1e-12)
+            added[at, at] = 0
+        assert not added.any()
+
+
+def at_rest(s: FilterState, *slide) -> FilterState:
+    return s.advanced(s.stamp + 0.1, (s.camera, np.eye(CAMERA), np.zeros((CAMERA, CAMERA))), *slide)

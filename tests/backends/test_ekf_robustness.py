@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import backends
 from backends.ekf import EkfBackend
 from backends.ekf.innovation import Linearisation, Solution
 from backends.ekf.motion import EulerCamera
+from backends.ekf.solve import agreement
 from backends.iekf import IekfBackend
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
@@ -59,6 +61,20 @@ def test_a_shock_beyond_the_motion_model_is_followed(make):
     reports = run(backend, data)
     assert all(len(r.used) > len(r.rejected) for r in reports[1:])
     assert errors(backend, data.poses).max() < 0.05
+
+
+@BOTH
+@pytest.mark.parametrize("gap", [10.0, 1e9])
+def test_a_gap_measures_no_displacement_of_the_world(make, gap):
+    """The camera comes back to the same view, after it may have turned anyhow: its place is no better known."""
+    models = replace(MODELS, initial_position_sigma=10.0, initial_rotation_sigma=0.05)
+    data, known = scene(np.tile(path(10, 0.1, 0.2 * FORWARD, STILL), (3, 1, 1)), points=200), set()
+    backend = make(RIG, models)
+    for k, (stamp, _, seen) in enumerate(data):
+        step(backend, stamp + gap * (k // 10), seen, known)
+        if k % 10 == 9:
+            sigma = np.sqrt(np.trace(backend.estimate().covariance[3:, 3:]) / 3)
+            assert sigma == pytest.approx(10.0, rel=0.01)
 
 
 @BOTH
@@ -199,3 +215,13 @@ def test_a_roll_in_one_step(make, degrees):
         assert report.status is UpdateStatus.OK and len(report.rejected) <= 1
         found.append(nees(backend, rolled))
     assert max(found) < chi2.ppf(0.9999, 6)
+
+
+def test_of_two_agreements_of_minorities_the_larger_counts(monkeypatch):
+    agreeing = iter([4, 1])
+    found = lambda _: SimpleNamespace(used=np.arange(12) < next(agreeing))  # noqa: E731
+    monkeypatch.setattr("backends.ekf.solve.gate", lambda update, T: T)
+    monkeypatch.setattr("backends.ekf.solve._agreed", found)
+    camera, covariance = SimpleNamespace(pose=np.eye(4)), SimpleNamespace(P=np.eye(3))
+    update = SimpleNamespace(camera=camera, covariance=covariance, z=np.zeros((12, 3)))
+    assert agreement(update, np.eye(4), lambda: None).used.sum() == 4

@@ -1,9 +1,10 @@
-"""Detection and description: what does not need the reference."""
+"""Detection and description, also against OpenCV's own SURF, kept in surf_reference.npz."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from frontends.surf import Surf
 from tests.frontends.scenes import photograph, texture, warped, zoom_about
@@ -135,3 +136,76 @@ def test_16_dimensions_are_the_four_central_areas_of_64(upright):
     off = np.abs(short - central)
     assert (off < 1e-5).mean() > 0.9
     assert off.max() < 0.02
+
+
+#: Lobes (left, top, right, bottom, weight) of the filters, in ninths of the size.
+DXX = ((0, 2, 3, 7, 1), (3, 2, 6, 7, -2), (6, 2, 9, 7, 1))
+DYY = tuple((top, left, bottom, right, w) for left, top, right, bottom, w in DXX)
+DXY = ((1, 1, 4, 4, 1), (5, 1, 8, 4, -1), (1, 5, 4, 8, -1), (5, 5, 8, 8, 1))
+
+
+def plain_response(sums: np.ndarray, x: float, y: float, size: float) -> float:
+    """Determinant of the Hessian by box filters about a pixel; `sums` are those above and left of pixel corners."""
+
+    def above(u: float, v: float) -> float:
+        column, row = int(u), int(v)
+        a, b = u - column, v - row
+        four = sums[row : row + 2, column : column + 2]
+        return float((1 - b) * ((1 - a) * four[0, 0] + a * four[0, 1]) + b * ((1 - a) * four[1, 0] + a * four[1, 1]))
+
+    means = []
+    for lobes in (DXX, DYY, DXY):
+        total = 0.0
+        for *corners, weight in lobes:
+            left, right = (x + 0.5 + size * (c / 9 - 0.5) for c in (corners[0], corners[2]))
+            top, bottom = (y + 0.5 + size * (c / 9 - 0.5) for c in (corners[1], corners[3]))
+            box = above(right, bottom) - above(right, top) - above(left, bottom) + above(left, top)
+            total += weight * box / ((right - left) * (bottom - top))
+        means.append(total)
+    xx, yy, xy = means
+    return xx * yy - 0.81 * xy**2  # the weight 0.9 squared: Bay et al., 2008, Eq. 3
+
+
+def test_responses_are_those_of_plain_filters_at_the_same_place():
+    image = photograph(texture(120, 160, seed=5))
+    surf = Surf(threshold=200)
+    found = surf.localise(image, surf.detect(image))
+    sums = np.pad(np.cumsum(np.cumsum(image.astype(float), axis=0), axis=1), ((1, 0), (1, 0)))
+    expected = [plain_response(sums, *uv, size) for uv, size in zip(found.uv, found.size)]
+    assert len(found) > 30
+    off = np.abs(found.response / expected - 1)  # it was taken a last small step earlier
+    assert np.median(off) < 0.003 and np.quantile(off, 0.95) < 0.02
+
+
+CASES = [
+    (image, layers, mode, threshold)
+    for image in ("shelf_320x240", "shelf_752x480")
+    for layers in (2, 3)
+    for mode in ("oriented", "upright")
+    for threshold in (100, 1000)
+]
+
+
+@pytest.fixture(scope="module")
+def reference(slam_data):
+    return np.load(slam_data / "surf_reference" / "surf_reference.npz")
+
+
+@pytest.mark.parametrize(("image", "layers", "mode", "threshold"), CASES)
+def test_reference(reference, image, layers, mode, threshold):
+    case = f"{image}/layers{layers}_{mode}_threshold{threshold}"
+    rows, expected = reference[f"{case}/keypoints"], reference[f"{case}/descriptors"]
+    surf = Surf(threshold, layers=layers, upright=mode == "upright")
+    found, descriptors = surf.detect_and_describe(reference[f"{image}/image"])
+    scaled = np.array([1, 1, 1e4])  # features of another octave are never the nearest
+    distance, nearest = cKDTree(np.c_[found.uv, found.octave] * scaled).query(np.c_[rows[:, :2], rows[:, 5]] * scaled)
+    same = (distance < 0.01) & (found.size[nearest] == rows[:, 2]) & (found.laplacian[nearest] == rows[:, 6])
+    same &= np.abs(found.response[nearest] / rows[:, 4] - 1) < 1e-4
+    assert same.mean() >= 0.995
+    assert len(found) <= 1.005 * len(rows)
+    nearest, rows, expected = nearest[same], rows[same], expected[same]
+    turn = (np.rad2deg(found.angle[nearest]) - rows[:, 3] + 180) % 360 - 180
+    assert (np.abs(turn) < 0.05).mean() >= 0.99
+    cosine = (descriptors[nearest] * expected).sum(axis=1)
+    assert np.median(cosine) >= 0.995
+    assert np.percentile(cosine, 1) >= 0.965

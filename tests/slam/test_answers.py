@@ -9,12 +9,13 @@ import pytest
 
 from backends.ekf import EkfBackend
 from frontends.surf import SurfFrontend
-from slam.data import StereoFrame
+from slam.data import Observations, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError, PartError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.frontends.scenes import stereo_pair
+from tests.scripts import load_script
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
 LEFT, RIGHT = stereo_pair(12.25)
@@ -46,6 +47,20 @@ ANSWERS = [
     ("recent", lambda r: replace(r, poses=0 * r.poses), "recent: poses is no rotation"),
     ("positions", lambda x: x[:-1] if len(x) else None, "positions:? must be (of type|an) (ndarray|array)"),
 ]
+
+
+def test_a_path_of_another_type_and_places_of_an_estimate_that_is_none_are_named():
+    """The first ended within this package; the second was laid to a method that a guarded class need not have."""
+    system = StereoSlam(RIG, "surf", Changed("trajectory", lambda path: [path]))
+    system.process(LEFT, RIGHT, 0.0)
+    with pytest.raises(SlamError, match=r"Changed\.trajectory: must be of type Trajectory, got list"):
+        system.trajectory()
+    lost = load_script("docs/examples/pose_fit.py").PoseFit(RIG, models=EstimatorModels())
+    lost.predict(0.0)
+    lost.add(Observations(np.array([3]), np.array([[160.0, 120.0]]), np.array([[150.0, 120.0]])))
+    lost._backend.points[3] = np.full(3, np.nan)
+    with pytest.raises(SlamError, match=r"^PoseFit\.estimate: positions is not finite"):
+        lost.positions(np.array([3]))
 
 
 @pytest.mark.parametrize("method,change,words", ANSWERS)

@@ -30,7 +30,7 @@ def some_map(count=20, dimensions=16):
     return SavedMap(
         np.arange(count) * 2, rng.standard_normal((count, 3)), np.tile(0.01 * np.eye(3), (count, 1, 1)),
         (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32), np.ones(count, np.int8),
-        np.arange(count), np.arange(count) + 1, "surf", "somewhere", "a test",
+        np.arange(count), np.arange(count) + 1, "surf",
     )  # fmt: skip
 
 
@@ -141,9 +141,9 @@ def test_new_landmarks_get_ids_that_no_keyframe_has():
 ])  # fmt: skip
 def test_what_cannot_be_is_refused(name: str, value: np.ndarray):
     arrays = map_arrays(saved(KEYFRAMES))
-    assert len(map_of(arrays, {}, "a.map").keyframes) == 4
+    assert len(map_of(arrays, "", "a.map").keyframes) == 4
     with pytest.raises(SlamError, match=r"^a\.map: ") as error:
-        map_of(arrays | {name: value.astype(arrays[name].dtype)}, {}, "a.map")
+        map_of(arrays | {name: value.astype(arrays[name].dtype)}, "", "a.map")
     assert "\n" not in str(error.value)
 
 

@@ -10,15 +10,14 @@ import numpy as np
 import backends
 from slam.bodies.belief import BodyBelief
 from slam.bodies.estimator import FRAMES, BodyEstimator
-from slam.bodies.frame import OnlinePose, recent_poses
 from slam.data import Observations
 from slam.evaluation.metrics import nees
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.interfaces import RecentBackend
 from slam.models import EstimatorModels, MotionModel, models_for
 from slam.object_data import ObjectEstimate, ObjectObservations
+from slam.third_party import OnlinePose, recent_of
 
 SIGMA = 0.7
 HANDHELD = StereoRig.rectified_pair(260.0, 159.5, 119.5, 0.12, 320, 240)
@@ -180,8 +179,7 @@ def follow(
         path = [*path[-FRAMES:], OnlinePose(scene.rig, SIGMA, e, local[old & deep])]
         given = scene.observations(k, rng, outliers if k else 0.0)
         given = given if rule is None else rule(k, given)
-        recent = backend.recent(FRAMES + 1) if isinstance(backend, RecentBackend) else None
-        belief = estimator.updated(belief, 7, given, recent_poses(recent, path))
+        belief = estimator.updated(belief, 7, given, recent_of(backend, path))
         if belief is not None:
             yield k, belief, e.T_world_left
         backend.add(seen.select(~old & deep))

@@ -49,13 +49,16 @@ def test_the_test_of_a_window_is_that_of_two_motions(known):
     """Also where a few near points know more of some motions than all others."""
     moved, view = scene(count=60, near=6, shift=(0.004, 0.0, 0.0))
     moved.W[6:] *= known
-    L, eta, dWd = scene_kernels.normal_equations(moved.points, moved.d, 0.5 * moved.W, moved.lag)
+    sums = scene_kernels.normal_equations(moved.points, moved.d, 0.5 * moved.W, moved.lag)
     windows = [np.arange(3, 9), np.arange(6), np.arange(5, 60, 9)]
-    starts, tracks = np.cumsum([0, *map(len, windows)]), np.concatenate(windows)
-    place, asked = (np.zeros((3, 3)), np.ones((3, 3))), np.full(61, 5.0)
-    values = scene_kernels.groups_apart(L, eta, dWd, view, starts, tracks, *place, asked, 4)[1]
-    full = np.zeros((60, 6, 6))
-    full[:, *np.tril_indices(6)] = L
+    cell = np.arange(60) + np.zeros((8, 1), int)  # a window for each track
+    for kind, tracks in enumerate(windows):
+        cell[kind, tracks] = 2**35 + 2**23 + 2**11  # and one about the origin
+    values = scene_kernels.groups_apart(
+        sums, view, np.sort(60 * cell + np.arange(60)), np.full((1, 3), 100.0), np.full(61, 5.0), 4
+    )[1]
+    full, eta = np.zeros((60, 6, 6)), sums[:, 21:27]
+    full[:, *np.tril_indices(6)] = sums[:, :21]
     full += np.swapaxes(np.tril(full, -1), 1, 2)
     rest = np.arange(6, 60)
     H, G = (full[k].sum(axis=0) + np.diag(scene_kernels.PRIOR) for k in (windows[1], rest))

@@ -23,7 +23,9 @@ WINDOW = 12
 SLOT = WINDOW - 1
 SIGMA = 0.002  # [m]
 RIG = StereoRig.rectified_pair(260.0, 160, 120, 0.12, 320, 240)
-FRAME: Any = SimpleNamespace(setup=SimpleNamespace(config=ObjectsConfig()), slot=SLOT, resolves=lambda _: True)
+FRAME: Any = SimpleNamespace(
+    setup=SimpleNamespace(config=ObjectsConfig()), slot=SLOT, eye=np.zeros(3), resolves=lambda _: True
+)
 TIMES = (np.arange(WINDOW) - SLOT) / 30.0
 
 
@@ -104,17 +106,21 @@ def test_a_part_that_turns_otherwise_leaves_and_comes_back_only_on_proof() -> No
     assert (tracks.body[lid] == -1).all()
 
 
-@pytest.mark.parametrize(("inside", "solid"), [(0, True), (6, True), (12, False)])
-def test_what_encloses_points_that_stand_still_is_no_body(inside: int, solid: bool) -> None:
-    """The shadow of somebody who walks, for instance: the ground shows within it."""
+@pytest.mark.parametrize(
+    ("still", "behind", "certain", "solid"),
+    [(0, 0, 0, True), (6, 0, 0, True), (12, 0, 0, False), (12, 1, 0, False), (12, 1, PROOF, True)],
+)
+def test_what_encloses_points_that_stand_still_is_no_body(still: int, behind: int, certain: int, solid: bool) -> None:
+    """The shadow of somebody who walks: the ground shows within it; a body not proven yet shows nothing behind it."""
     poses = path(MOVING)
-    ground = 0.6 * corners(12, 4) + poses[SLOT, :3, 3]
-    ground[inside:, 0] += 0.5  # the others lie beside the body
+    ground = 0.6 * corners(12, 4) + poses[SLOT, :3, 3] + behind * AHEAD
+    ground[still:, 0] += 0.5  # the others lie beside the body
     tracks = table(np.concatenate([seen_from(poses, corners(16, 1), 2), seen_from(STILL, ground, 3)]))
-    body = body_along(poses, np.arange(16), tracks)
+    body = replace(body_along(poses, np.arange(16), tracks), certain=certain)
     gains, against = membership.update_members({1: body}, FRAME, tracks)[1]
-    assert against == inside
-    assert with_evidence(body, 0.0, int((gains > CLEAR).sum()), against).proven == solid
+    assert against == (0 if behind and certain else still)
+    after = with_evidence(replace(body, certain=PROOF), 0.0, int((gains > CLEAR).sum()), against)
+    assert after.proven == solid
 
 
 @pytest.mark.parametrize(

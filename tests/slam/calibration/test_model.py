@@ -1,14 +1,19 @@
+"""What errors of a rig do to its pixels, and what a pair of views tells of them."""
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
 from slam.calibration import Revision, RigCorrection, RigModel
+from slam.calibration.pairs import Pair, View, fit_motion, match, move, noise_variances, pair_evidence, pair_of
+from slam.calibration.posterior import prior_information
 from slam.data import StereoFeatures
 from slam.geometry import se3
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
-from tests.slam.calibration.drives import CAR, parameters
+from tests.slam.calibration.drives import CAR, Street, parameters
+from tests.slam.numeric import jacobian
 from tests.slam.scene import GENERAL_RIG
 
 MODEL = RigModel(CAR)
@@ -88,3 +93,87 @@ def test_features_are_corrected_and_revised(rig):
     np.testing.assert_allclose(before.rows(rows[0]), rows[1], atol=1e-6)
     np.testing.assert_allclose(before.undone(rows[1]), rows[0], atol=1e-4)
     np.testing.assert_allclose(Revision(before, after).rows(rows[1]), rows[2], atol=1e-4)
+
+
+NONE = parameters()
+NOISE = np.diag([0.4, 0.4, 0.2]) ** 2
+
+
+def test_motion_in_disparity_space_is_the_rigid_one():
+    T = se3.exp(np.array([0.03, -0.1, 0.02, 0.5, 0.2, -2.0]))
+    points = np.random.default_rng(0).uniform((-5, -3, 6), (5, 3, 30), (20, 3))
+    x = MODEL.points(CAR.project_stereo(points)[0])
+    R, t = T[:3, :3], T[:3, 3] / CAR.baseline
+    moved, J_point, J_motion = move(x, R, t, F)
+    there = MODEL.points(CAR.project_stereo(se3.transform(T, points))[0])
+    np.testing.assert_allclose(moved, there, atol=1e-9)
+    for i in range(3):
+        numeric = jacobian(lambda p: move(p[None], R, t, F)[0][0], x[i])
+        np.testing.assert_allclose(J_point[i], numeric, rtol=1e-5, atol=1e-5)
+        numeric = jacobian(lambda xi, p=x[i]: move(p[None], se3.so3_exp(xi[:3]) @ R, t + xi[3:], F)[0][0], np.zeros(6))
+        np.testing.assert_allclose(J_motion[i], numeric, rtol=1e-5, atol=1e-4)
+
+
+def test_a_pair_without_noise_gives_the_truth():
+    rng = np.random.default_rng(0)
+    theta = parameters(right_cx=4e-4, yaw=-2e-3, left_k1=-3e-3, right_k1=-2e-3)
+    R, t = se3.so3_exp(np.array([0.03, -0.1, 0.02])), np.array([0.5, 0.2, -3.0])
+    ideal = np.column_stack([rng.uniform(-500, 500, 300), rng.uniform(-150, 150, 300), rng.uniform(0, 40, 300)])
+    pair = [ideal, move(ideal, R, t, F)[0]]
+    measured = [x - MODEL.field(x)[:, :3] @ theta for x in pair]
+    corrected = [x + MODEL.shift(x, theta)[:, :3] for x in measured]
+    evidence = pair_evidence(MODEL, Pair(*corrected, R, t), theta, NOISE)
+    strong = 1e8
+    mean = np.linalg.solve(prior_information(MODEL) + strong * evidence.S, strong * evidence.e)
+    far = MODEL.field(MODEL.far())[:, 2]
+    np.testing.assert_allclose(far @ mean, far @ theta, atol=0.06)  # of up to 2 px
+
+
+def distant_views():
+    """Two views along the road, the true motion between them, and the street."""
+    street = Street(3, count=20000, length=200)
+    poses = [np.eye(4), se3.exp(np.array([0, 0.1, 0, 0, 0, 40]))]
+    poses[1][:3, 3] = [2.0, 0.0, 40.0]
+    every = [street.features(float(k), T, most=8000, noise=0.2) for k, T in enumerate(poses)]
+    return poses, every
+
+
+def test_views_forty_metres_apart_are_solved_from_the_poses_of_the_system():
+    poses, every = distant_views()
+    off = se3.exp(np.array([0.01, 0.01, 0.0, 0.5, 0.0, 1.0]))  # as poses of a run that has drifted
+    first = View.of(MODEL, every[0], poses[0], 10**6)
+    second = View.of(MODEL, every[1], poses[1] @ off, 10**6)
+    pair = pair_of(MODEL, first, second, NONE, NOISE, 0, match(first, second))
+    assert len(pair.first) >= 30
+    evidence = pair_evidence(MODEL, pair, NONE, NOISE)
+    assert evidence is not None and evidence.S[MODEL.names.index("yaw")].any()
+    # From no motion the same pair has no solution: that is why the poses are asked for, and such pairs are counted.
+    still = Pair(pair.first, pair.second, np.eye(3), np.zeros(3))
+    assert pair_evidence(MODEL, still, NONE, NOISE) is None
+
+
+def noisy_views(pixel, disparity, outliers=0):
+    """Points and their noisy measurements in two views, and the motion."""
+    rng = np.random.default_rng(2)
+    R, t = se3.so3_exp(np.array([0.0, 0.1, 0.0])), np.array([0.3, 0.0, -4.0])
+    ideal = np.column_stack([rng.uniform(-500, 500, 800), rng.uniform(-150, 150, 800), rng.uniform(3, 40, 800)])
+    views = [x + rng.standard_normal(x.shape) * [pixel, pixel, disparity] for x in (ideal, move(ideal, R, t, F)[0])]
+    views[1][:outliers] += rng.normal(0, 30, (outliers, 3))
+    return views, R, t
+
+
+def test_the_noise_of_pixels_and_of_disparities_is_told_apart():
+    for pixel, disparity in ((0.7, 1.0), (0.3, 0.1)):
+        views, R, t = noisy_views(pixel, disparity, outliers=80)
+        noise = np.diag([pixel, pixel, disparity]) ** 2
+        found = np.sqrt(noise_variances(Pair(*views, R, t), F, noise))
+        np.testing.assert_allclose(found, [pixel, disparity], rtol=0.2)
+
+
+def test_a_motion_is_found_to_the_end():
+    """Steps shrink slowly: the first small one is not near the solution."""
+    views, R, t = noisy_views(0.2, 0.2)
+    noise = np.diag([0.2, 0.2, 0.2]) ** 2
+    near, far = (fit_motion(*views, R, t + off, F, noise) for off in (np.zeros(3), np.array([0.5, 0.3, 1.0])))
+    np.testing.assert_allclose(near.moved, far.moved, atol=0.02)
+    assert np.abs(near.t - t).max() < 0.1

@@ -13,15 +13,7 @@ from slam.calibration.saved import agreement, agreement_in_words, joint_calibrat
 from slam.errors import CalibrationError, ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.system import StereoSlam
-from tests.slam.calibration.drives import (
-    CAR,
-    Street,
-    disparity_error,
-    drive,
-    parameters,
-    pose,
-    residual_fields,
-)
+from tests.slam.calibration.drives import CAR, Street, disparity_error, drive, parameters, pose, residual_fields
 
 TURNED = parameters(pitch=5e-4, yaw=5e-4, roll=5e-4)
 

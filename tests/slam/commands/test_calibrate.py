@@ -1,14 +1,12 @@
 from __future__ import annotations
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import slam
 from slam.calibration import RigModel, RigPosterior
-from slam.commands.calibrate import calibrate
 from slam.errors import SlamError
 from slam.run.calibrating import _judged
 from tests.scripts import command
@@ -65,14 +63,6 @@ def test_it_is_the_prior_of_a_run(made, tmp_path):
     expected = json.loads(file.read_text())["parameters"]
     assert [row["mean"] for row in found] == [row["mean"] for row in expected]
     command("run", WORLD, "--calibration", tmp_path / "first", "--frames", "0:1", "--out", tmp_path / "third", *QUIET)
-
-
-def test_a_camera_is_refused_without_a_word_of_its_frames(tmp_path, monkeypatch, capsys):
-    camera = SimpleNamespace(live=True, name="camera:0", rig=slam.open_sequence(WORLD).rig)
-    monkeypatch.setattr("slam.commands.calibrate.open_sequence", lambda text, format: camera)
-    with pytest.raises(SlamError, match="a recording is needed"):
-        calibrate(["camera:0"], tmp_path / "rig.json", (), (0, None), None, quiet=False, overwrite=False)
-    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ from slam.geometry.se3 import exp
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.run.options import RunOptions
 from slam.run.plots import draw_paths
-from slam.run.plots import plot_folders as plot_runs
 from slam.run.run_data import RunData, pose_errors
 from slam.run.runner import run
 from slam.sequences import open_sequence
@@ -25,14 +24,6 @@ def finished(tmp_path_factory):
     folder, config = tmp_path_factory.mktemp("run"), SystemConfig.for_kind("handheld")
     run(open_sequence(WORLD), RunOptions("ekf", "surf", config, folder))
     return RunData.read(folder, "a")
-
-
-def test_a_path_that_is_one_dot_is_drawn_without_a_word(tmp_path, caplog):
-    config = SystemConfig.for_kind("handheld")
-    run(open_sequence("synthetic:desk?frames=1"), RunOptions("ekf", "surf", config, tmp_path / "a"))
-    caplog.clear()
-    plot_runs([tmp_path / "a"], tmp_path / "a.png", "summary")
-    assert not caplog.messages
 
 
 def test_a_true_path_is_drawn_where_all_runs_have_the_same(finished):
@@ -49,17 +40,19 @@ def test_a_true_path_is_drawn_where_all_runs_have_the_same(finished):
 
 def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(finished):
     """What the headline says of the covariances counts both."""
-    _, error, sigma = pose_errors(finished)
+    _, error, sigma, expected = pose_errors(finished)
     summary = finished.summary["accuracy"]["online"]
     assert np.sqrt(np.mean(error[:, 1] ** 2)) == pytest.approx(summary["rotation RMSE from start [deg]"], rel=1e-3)
     assert (error[1:, 1] < 5 * sigma[1:, 1]).all() and (sigma[1:, 1] > 0).all()
+    np.testing.assert_allclose(expected, sigma)  # of a world, whose truth is exact
+    np.testing.assert_array_equal(sigma, finished.deviations)
 
 
-def test_where_the_truth_s_sensor_is_and_its_clock_are_part_of_the_claimed_error_and_its_turn_of_none(finished):
+def test_where_the_truth_s_sensor_is_and_its_clock_are_part_of_the_expected_error_and_its_turn_of_none(finished):
     """A turn of 1° made σ a metre on a drive of 60 m, beside errors of a centimetre: these are without it."""
     noises = {"mounting": 0.1}, {"lever": 0.1}, {"clock": 0.1}
-    _, _, exact = pose_errors(finished)
-    turned, moved, late = (pose_errors(replace(finished, truth_noise=TruthNoise(**noise)))[2] for noise in noises)
+    exact = pose_errors(finished)[3]
+    turned, moved, late = (pose_errors(replace(finished, truth_noise=TruthNoise(**noise)))[3] for noise in noises)
     np.testing.assert_allclose(turned, exact)
     assert (moved[1:, 0] > exact[1:, 0]).all()
     rates = np.diff(finished.truth.positions, axis=0) / np.diff(finished.truth.stamps)[:, None]

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +9,7 @@ from typer.testing import CliRunner
 from slam.commands.cli import app
 from slam.compare.plan import CLOSED_LOOP, Plan
 from slam.compare.sweep import Run
-from slam.compare.tables import caution, groups, sentences
+from slam.compare.tables import groups, sentences
 from slam.errors import ConfigurationError
 from slam.geometry.trajectory import Trajectory
 
@@ -63,10 +62,3 @@ def test_without_a_true_path_the_distance_between_the_paths_is_told_and_doubt_is
     monkeypatch.setattr("slam.commands.compare.compare", lambda *given: [run for run, _ in runs])
     ended = CliRunner().invoke(app, ["compare", "drive", "--out", str(tmp_path / "out")])
     assert ended.exit_code == len(told)
-
-
-def test_what_so_many_trials_can_show_is_said():
-    plan = Plan(("synthetic:desk",), ("ekf", "smoother", "window"))
-    for trials, words in ((1, "One trial cannot"), (2, "2 trials can hardly"), (12, "With 12 trials only")):
-        assert caution(plan, trials).startswith(words)
-    assert not caution(replace(plan, backends=("ekf",)), 12)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -25,3 +27,7 @@ def test_pixels_of_the_still_world_are_found_again(boxes):
     assert (points.errors(0, ids, uv + np.array([0, 4.0]))[still] > 3.9).all()
     moved = points.errors(30, ids[still], uv[still])  # the camera moves, so the same pixels show other points
     assert np.median(moved) > 1.0
+    rows = np.arange(len(uv))
+    result = SimpleNamespace(features=SimpleNamespace(uv_left=uv), matched=ids, matched_features=rows, added=ids[:0],
+                             added_features=rows[:0])  # fmt: skip
+    assert np.isinf(points.of_matches(0, result)).sum() == (~still).sum() > 0  # matches of what moves are wrong, too

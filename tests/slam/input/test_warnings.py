@@ -14,7 +14,10 @@ import slam
 from slam.data import StereoFeatures
 from slam.errors import SequenceError
 from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import exp
 from slam.input import warnings
+from slam.input.moment import MomentWatch
 from slam.input.pair import pair_geometry, points_of, share_shown
 from slam.input.warnings import InputWarnings
 from slam.models import models_for
@@ -252,18 +255,13 @@ def test_one_camera_twice_is_refused_and_a_single_frame_loses_its_right_image():
     assert any("frame 2: left and right are one and the same image; it and others" in line for line in system.warnings)
 
 
-def test_a_camera_that_freezes_measures_nothing():
-    """A right image that stays is not used; with a left one that stays the whole frame is a repeated one."""
+def test_a_right_image_that_stays_is_not_used():
     frames = list(slam.open_sequence("synthetic:desk?frames=6"))
     right = [replace(f, right=frames[2].right if 2 <= f.index < 5 else f.right) for f in frames]
     system = slam.StereoSlam(RIG, "surf", "ekf")
     seen = [system.process(frame).features.has_stereo.sum() > 50 for frame in right]
     assert seen == [True, True, True, False, False, True]
     assert any("frame 3: the right image is that of the frame before: its camera froze" in w for w in system.warnings)
-    left = [replace(f, left=frames[2].left if 2 <= f.index < 5 else f.left) for f in frames]
-    system = slam.StereoSlam(RIG, "surf", "ekf")
-    before = [system.process(frame).status.value for frame in left]
-    assert before[3:5] == ["predicted"] * 2 and before[5] == "tracked"
 
 
 @pytest.mark.parametrize(("world", "late"), [("aisle?frames=120", -1), ("aisle?frames=120", 2), ("desk?frames=72", 1)])
@@ -323,3 +321,48 @@ def test_a_baseline_in_another_unit_is_doubted(baseline, doubted):
 
 def test_a_calibration_that_cannot_be_that_of_the_images_leaves_no_path_to_trust():
     assert InputWarnings(of_size(0.5), models_for("handheld"), 1.5).doubt
+
+
+WIDE = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
+
+
+def doubt(late, step, box, frames, rows=lambda x, y: 0.4, since=0):
+    """What is said of frames with steps (6,) and points in a box, whose right images are late from one frame on."""
+    rng, watch, T = np.random.default_rng(0), MomentWatch(WIDE), np.eye(4)
+    last = exp(step(rng))
+    for k in range(frames):
+        points, now = rng.uniform(*box, (200, 3)), exp(step(rng))  # `now` to the next frame, `last` from the one before
+        left, right = WIDE.project(points)
+        there = points @ last[:3, :3].T + last[:3, 3] if late > 0 else (points - now[:3, 3]) @ now[:3, :3]
+        off = abs(late) * (WIDE.left.project(there) - left)[:, 1] if k >= since else 0.0
+        right[:, 1] += off + rows(*(left - [160.0, 120.0]).T / 300.0) + rng.normal(0, 0.1, len(points))
+        ones = np.ones(len(points))
+        looks = np.ones((len(points), 4), "f4")
+        seen = StereoFeatures(0.0, left, right, ones, 0 * ones, ones, ones.astype(np.int8), looks)
+        watch.add(seen, T, measured=True)
+        T, last = T @ now, now
+    return watch.doubt
+
+
+def by_hand(rng):
+    return rng.normal(0, 1, 6) * [0.006, 0.006, 0.006, 0.01, 0.01, 0.01]
+
+
+@pytest.mark.parametrize(
+    ("late", "frames", "since", "word"),
+    [(0.0, 31, 0, ""), (0.3, 31, 0, "late"), (-0.3, 31, 0, "early"), (0.3, 500, 300, "late"), (0.0, 500, 0, "")],
+)
+def test_rows_that_follow_the_motion(late, frames, since, word):
+    """A right camera that is pitched moves rows, too, but in the same way whatever the motion is."""
+    said = doubt(late, by_hand, ([-2, -1.5, 3], [2, 1.5, 9]), frames, since=since)
+    assert bool(said) == bool(word) and f"right images were {word} by" in (said or "right images were  by")
+
+
+@pytest.mark.parametrize("late", [0.0, 0.3])
+def test_rows_that_differ_by_the_calibration_are_no_lag_where_the_motion_is_always_the_same(late):
+    """A car that drives straight on: its motion moves rows in the same way in all frames, as the calibration does."""
+    said = doubt(
+        late, lambda rng: np.array([0, 0, 0, 0, 0, 0.5]), ([-6, -1, 8], [6, 3, 50]), 31,
+        lambda x, y: 1.0 + 3.0 * x - 4.0 * y + 2.0 * x * y,
+    )  # fmt: skip
+    assert ("late by" in said) if late else said == ""

@@ -11,7 +11,7 @@ from experiments.simulated_recording import true_recording
 from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.config import SystemConfig
 from slam.data import FrameStatus
-from slam.errors import MeasurementError, SequenceError, SlamError
+from slam.errors import SequenceError
 from slam.run.recording import RecordedFrame, Recording, load_recording, save_recording
 from slam.run.replay import replay
 from slam.system import StereoSlam
@@ -130,16 +130,3 @@ def test_damaged_files_are_refused_in_one_line(recording, tmp_path, fault):
     with pytest.raises(SequenceError, match=words) as caught:
         load_recording(tmp_path / "bad.npz")
     assert "bad.npz" in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_what_a_back_end_tells_of_its_last_poses_is_checked(recording, monkeypatch):
-    backend = StereoSlam(recording.rig, None, "ekf").backend
-    monkeypatch.setattr(backend, "recent", lambda n: [])
-    with pytest.raises(SlamError, match=r"^frame 0: EkfBackend\.recent: must be of type RecentPoses, got list"):
-        list(replay(recording, backend))
-
-
-def test_recordings_are_checked_when_made(recording):
-    with pytest.raises(MeasurementError, match="removed"):
-        first, *others = recording.frames
-        replace(recording, frames=(replace(first, removed=np.array([10**6])), *others))

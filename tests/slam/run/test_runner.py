@@ -14,7 +14,6 @@ import pytest
 
 from slam.atlas.config import AtlasConfig
 from slam.atlas.map_io import load_map
-from slam.calibration.estimator import SelfCalibration
 from slam.config import SystemConfig
 from slam.errors import SequenceError, SlamError
 from slam.geometry.trajectory import Trajectory
@@ -49,13 +48,6 @@ def test_landmarks_that_have_left_the_map_are_kept_where_they_were(tmp_path, mon
     assert len(data.old) > 10
     away = np.linalg.norm(data.old - data.online.positions.mean(axis=0), axis=1)
     assert 0.5 < np.median(away) < 6.0  # on the shelves
-
-
-def test_what_the_calibration_is_warned_of_is_said_and_kept(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(SelfCalibration, "warning", "the images fit another focal length")
-    summary = run(open_sequence("synthetic:aisle?frames=2"), options(tmp_path))
-    assert caplog.messages == summary["warnings"] == ["the images fit another focal length"]
-    assert summary["doubt"] == "" == summary["tracking"]
 
 
 def test_a_run_leaves_its_files(tmp_path):
@@ -122,5 +114,5 @@ def test_a_stopped_run_keeps_its_frames(tmp_path, kill, ignored):
     require_whole(tmp_path, out)
     if kill is not signal.SIGKILL and not ignored:
         assert f"stopped by {kill.name}; frames done so far are kept: `slam plot" in errors
-        assert json.loads((out / "summary.json").read_text())["ended"] == f"stopped: {kill.name}"
+        assert json.loads((out / "summary.json").read_text())["ended"] == "ended by the user"
         assert (out / "landmarks.csv").exists()

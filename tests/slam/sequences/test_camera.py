@@ -1,7 +1,8 @@
-"""Cameras, their part played by video files and by a class that stops giving frames when it is told to."""
+"""Cameras, played by video files and by a class that stops giving frames, and frames at their own rate."""
 
 from __future__ import annotations
 
+import threading
 import time
 from pathlib import Path
 
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 
 import slam
+from slam.data import StereoFrame
 from slam.errors import SequenceError
 from slam.sequences import camera, is_live
+from slam.sequences.live import LiveFrames
 from tests.recordings import write_opencv
 
 WIDTH, HEIGHT = 160, 120
@@ -102,3 +105,68 @@ def test_a_camera_that_stays_silent_ends_the_run_with_one_line(rig_here, played)
     assert [next(frames).index, next(frames).index] == [0, 1]
     with pytest.raises(SequenceError, match=r"camera:0: no frames for 0.05 s"):
         next(frames)
+
+
+IMAGE = np.zeros((4, 4), np.uint8)
+
+
+def frames(count, period=0.01):
+    return [StereoFrame(k, 5.0 + period * k, IMAGE, IMAGE) for k in range(count)]
+
+
+def threads():
+    return [thread for thread in threading.enumerate() if thread.name == "live frames"]
+
+
+def test_whoever_is_fast_enough_gets_every_frame_at_its_time():
+    live, began = LiveFrames(frames(4, 0.25)), time.monotonic()
+    taken = [(frame.index, time.monotonic() - began) for frame in live]
+    assert [index for index, _ in taken] == list(range(4))
+    assert all(when >= 0.25 * index for index, when in taken)
+    assert live.dropped == 0 and not threads()
+
+
+def test_whoever_is_too_slow_gets_the_newest_and_what_is_left_out_is_counted():
+    live, indices = LiveFrames(frames(100, 0.005)), []
+    for frame in live:
+        indices.append(frame.index)
+        time.sleep(0.05)
+        assert live.age(frame) >= 0.05
+    assert indices == sorted(indices) and indices[-1] == 99 and 3 < len(indices) < 50
+    assert live.dropped == 100 - len(indices)
+
+
+def test_it_ends_while_no_frame_comes_although_the_driver_is_stuck(monkeypatch):
+    monkeypatch.setattr("slam.sequences.live._PARTING", 0.05)
+    stuck, until = threading.Event(), threading.Event()
+
+    def camera():
+        yield frames(1)[0]
+        stuck.wait(20)
+
+    live = LiveFrames(camera(), paced=False, until=until)
+    taking = iter(live)
+    next(taking)
+    threading.Timer(0.1, until.set).start()
+    began = time.monotonic()
+    assert list(taking) == []
+    assert time.monotonic() - began < 10
+    stuck.set()
+
+
+def test_an_error_of_the_source_is_raised_and_the_source_is_closed():
+    closed = threading.Event()
+
+    def camera():
+        try:
+            yield frames(1)[0]
+            raise ValueError("broken")
+        finally:
+            closed.set()
+
+    with pytest.raises(ValueError, match="broken"):
+        list(LiveFrames(camera(), paced=False))
+    assert closed.is_set()
+    for _ in LiveFrames(frames(1000, 0.01)):
+        break
+    assert not threads()

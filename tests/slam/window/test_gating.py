@@ -2,8 +2,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
-from slam.window.gating import squared_distances
+from slam.chi_square import chi_square_limit
+from slam.window.gating import _passing, squared_distances
 from slam.window.pose_only import PoseProblem, solve
 from slam.window.stereo import RectifiedStereo
 from tests.slam.scene import RIG
@@ -47,3 +49,11 @@ def test_a_left_pixel_alone_is_gated_with_two_degrees_of_freedom():
     known = 1e8 * np.eye(6)
     problem = PoseProblem(stereo, points, z, np.tile(np.eye(3), (20, 1, 1)), np.eye(4), known, 0.95)
     np.testing.assert_array_equal(solve(problem, np.eye(4))[1], np.arange(20) > 0)
+
+
+@pytest.mark.parametrize("dof", [2, 3])
+@pytest.mark.parametrize("scatter", [5.0, 20.0, 100.0])
+def test_how_many_wrong_observations_pass_follows_from_those_that_do_not(scatter, dof):
+    limit = chi_square_limit(dof, 0.999)
+    distances = scatter * np.random.default_rng(0).chisquare(dof, 20000)
+    assert _passing(distances[distances > limit], dof, 0.999) == pytest.approx(chi2.cdf(limit / scatter, dof), rel=0.1)

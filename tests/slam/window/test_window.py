@@ -1,5 +1,7 @@
 """The window solver against dense least squares, finite differences, and itself with something marginalised."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np
@@ -12,10 +14,12 @@ from slam.kernels.linear import cholesky
 from slam.runtime.compilation import kernel
 from slam.window import chart_kernels, pose_only, solver
 from slam.window.marginal import Conditional, marginalised
+from slam.window.motion import predict
 from slam.window.pose_only import PoseProblem
 from slam.window.problem import Motion, Places, RelativePrior, Rows, Window
 from slam.window.solver import linearised
 from slam.window.stereo import RectifiedStereo
+from tests.slam.numeric import jacobian
 
 RIG = StereoRig.rectified_pair(400, 319.5, 239.5, 0.12, 640, 480)
 STEREO = RectifiedStereo.of(RIG)
@@ -371,3 +375,16 @@ def test_a_reference_that_leaves_without_points_leaves_a_prior_of_poses():
     part = replace(w, rows=w.rows.select(w.rows.pose == 0))
     prior = marginalised(part, [0], np.zeros(0, bool), np.zeros((len(part.rows), 3, 2)))[0]
     assert len(prior.points) == 0 and prior.by_rig.shape == (len(prior.vector), 2)
+
+
+@pytest.mark.parametrize("intervals", [(0.1, 0.1), (0.1, 0.25), (0.4, 0.1)])
+def test_derivatives_of_the_next_pose_are_those_of_differences(intervals):
+    rng = np.random.default_rng(5)
+    T0 = se3.exp(rng.standard_normal(6) / 3)
+    T1 = T0 @ se3.exp(rng.standard_normal(6) / 10)
+    T2, J0, J1, _ = predict(T0, T1, *intervals)
+
+    def moved(change: np.ndarray) -> np.ndarray:
+        return se3.log(se3.inverse(T2) @ predict(T0 @ se3.exp(change[:6]), T1 @ se3.exp(change[6:]), *intervals)[0])
+
+    np.testing.assert_allclose(np.hstack([J0, J1]), jacobian(moved, np.zeros(12)), atol=1e-8)

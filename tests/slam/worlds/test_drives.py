@@ -1,11 +1,17 @@
+"""Drives along paths of files, and the streets beside them."""
+
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from slam.errors import SequenceError
+from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
 from slam.sequences import open_sequence
+from slam.worlds import WorldSequence, open_world
 from slam.worlds.drives import SAME_ROAD, STEP, Road, read_path, sampled
 from slam.worlds.paths import camera_poses
 
@@ -62,3 +68,48 @@ def test_a_road_driven_again_counts_once():
     back, aside = (np.concatenate([there, np.add(there[::-1], (x, 0, 0))]) for x in (SAME_ROAD - 1, 2 * SAME_ROAD))
     assert len(Road.along(back).xy) < 1.1 * len(once.xy) + 20
     assert len(Road.along(aside).xy) > 1.4 * len(once.xy)
+
+
+LAP = 450  # frames of a round in `loop`
+
+
+@pytest.fixture(scope="session")
+def loop(tmp_path_factory) -> Path:
+    """A file with two rounds of a circle of 450 m in KITTI's axes, on a slope; the second one repeats the first."""
+    angle = 2 * np.pi * np.arange(2 * LAP) / LAP
+    radius = LAP / (2 * np.pi)
+    positions = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 2 * np.sin(angle)])
+    zero = np.zeros(2 * LAP)
+    poses = camera_poses(positions, angle, zero, zero)
+    file = tmp_path_factory.mktemp("paths") / "loop.txt"
+    Trajectory(np.arange(2.0 * LAP), inverse(poses[0]) @ poses).write_kitti(file)
+    return file
+
+
+def opened(loop: Path, query: str = "") -> WorldSequence:
+    return open_world(f"drive?path={loop}&{query}")
+
+
+def test_a_round_later_the_same_landmarks_are_seen(loop):
+    sequence = opened(loop, "change=0&outliers=0&clutter=0&detect=1&sigma=0&descriptor_noise=0")
+    for k in (0, 100):
+        first, later = (sequence.simulate(n) for n in (k, k + LAP))
+        assert len(first.ids) > 80
+        a, b = np.argsort(first.ids), np.argsort(later.ids)
+        assert np.array_equal(first.ids[a], later.ids[b])
+        assert np.allclose(first.features.uv_left[a], later.features.uv_left[b], atol=1e-4)
+        assert np.allclose(first.features.descriptors[a], later.features.descriptors[b], atol=1e-4)
+
+
+def test_a_wrong_calibration_is_told_and_the_true_one_records():
+    right, wrong = open_world("town?sigma=0"), open_world("town?sigma=0&focal_error=0.005&turn_error=1")
+    assert wrong.rig is right.rig
+    assert wrong.world.rig.left.fu == pytest.approx(right.rig.left.fu / 1.005)
+    turned = wrong.world.rig.R @ right.rig.R.T
+    assert np.allclose([turned[2, 1], turned[0, 2], turned[1, 0]], 1e-3, atol=2e-6)
+    a, b = right.simulate(40), wrong.simulate(40)
+    ids, i, j = np.intersect1d(a.ids, b.ids, return_indices=True)
+    still = ids >= 0
+    centre = right.rig.left.u0, right.rig.left.v0
+    ratio = (a.features.uv_left[i[still]] - centre) / (b.features.uv_left[j[still]] - centre)
+    assert np.allclose(np.median(ratio, axis=0), 1.005, atol=1e-4)
