@@ -7,6 +7,7 @@ anew is left out.
 
 from __future__ import annotations
 
+import logging
 from functools import cached_property
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import landmark_key, pose_key
-from backends.smoother.graph import by_pose, held, minimised, solving
+from backends.smoother.graph import SolverError, by_pose, held, minimised, solving
 from backends.smoother.state import SmootherState
 from backends.smoother.tracks import GraphProblem, Tracks
 from slam.data import Estimate
@@ -40,7 +41,9 @@ class BatchBackend:
 
     A smoother runs along: it predicts, gates and gives the first values.
     All but `estimate` and `trajectory` are its own methods (`SmootherBackend`). The problem is solved when the path or
-    the landmarks are asked for; the pose alone is the smoother's, and so are landmarks that are no variables.
+    the landmarks are asked for; the pose alone is the smoother's, and so are landmarks that are no variables. Where
+    gtsam gives no covariances (motions of which some are ten thousand times as uncertain as others), the whole estimate
+    is the smoother's, and a warning is logged.
 
     Args:
         rig: the cameras.
@@ -67,22 +70,16 @@ class BatchBackend:
     @one_blas_thread
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
-        rough = self._smoother.estimate(landmarks=False)
         if not landmarks:
-            return rough
-        solution, marks = self._solved(), self._smoother.state.landmarks
-        rows = marks.order
-        serials = marks.serial[rows].tolist()
-        positions, covariances = marks.position[rows], np.zeros((len(rows), 3, 3))
-        others = np.array([serial not in solution.landmarks for serial in serials], bool)
-        covariances[others] = self._smoother.landmark_covariances(rows[others])
-        for row in np.flatnonzero(~others).tolist():
-            key = landmark_key(serials[row])
-            positions[row] = solution.values.atPoint3(key)
-            covariances[row] = solution.covariance(key, by_pose(solution.poses[0], positions[row]))
-        T = solution.poses[-1].copy()
-        P = solution.covariance(solution.newest, adjoint(inverse(T) @ solution.poses[0]))
-        return Estimate(rough.stamp, T, P, marks.ids[rows], positions, covariances)
+            return self._smoother.estimate(landmarks=False)
+        solution = self._solved()
+        try:
+            return solution.estimate(self._smoother)
+        except SolverError as error:
+            logging.getLogger(__name__).warning(
+                "batch: the estimate is the smoother's, as gtsam gives no covariances: %s", error
+            )
+            return self._smoother.estimate()
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
@@ -127,7 +124,7 @@ class _BatchSolution:
             for serial, z in zip(sight.serials.tolist(), sight.z.tolist()):
                 if serial in self.landmarks:
                     problem.factors.add(make.explicit(make.point(z), number, serial))
-        self._factors, self.newest = problem.factors, pose_key(s.number)
+        self._factors = problem.factors
         self.values = minimised(problem, _ITERATIONS)
         # (F, 4, 4) from its beginning on
         self.poses = np.array([self.values.atPose3(pose_key(number)).matrix() for number in numbers])
@@ -135,6 +132,22 @@ class _BatchSolution:
     @cached_property
     def _marginals(self) -> gtsam.Marginals:
         return gtsam.Marginals(self._factors, self.values)
+
+    def estimate(self, smoother: SmootherBackend) -> Estimate:
+        """Newest pose and landmarks; SolverError where gtsam gives no covariances."""
+        s, marks = self.state, self.state.landmarks
+        rows = marks.order
+        serials = marks.serial[rows].tolist()
+        positions, covariances = marks.position[rows], np.zeros((len(rows), 3, 3))
+        others = np.array([serial not in self.landmarks for serial in serials], bool)
+        covariances[others] = smoother.landmark_covariances(rows[others])
+        for row in np.flatnonzero(~others).tolist():
+            key = landmark_key(serials[row])
+            positions[row] = self.values.atPoint3(key)
+            covariances[row] = self.covariance(key, by_pose(self.poses[0], positions[row]))
+        T = self.poses[-1].copy()
+        P = self.covariance(pose_key(s.number), adjoint(inverse(T) @ self.poses[0]))
+        return Estimate(float(s.stamps[-1]), T, P, marks.ids[rows], positions, covariances)
 
     def covariance(self, key: int, by_first: Array) -> Array:
         """Marginal covariance (n, n) of a variable, which the first pose moves by `by_first` (n, 6); SolverError."""
