@@ -160,7 +160,10 @@ def main() -> int:
     cases = [(pixels, backend, start) for pixels in ("stereo", "left", ALONE) for backend in ONLINE for start in STARTS]
     runs = [start_up(sequence, known, backend, start, frames, pixels) for pixels, backend, start in cases]
     print(f"{len(known)} stored features, {frames} frames; of three wrong starts the worst. ", end="")
-    print("Sigmas of the system count errors of the rig, too.\n")
+    print(
+        "Sigmas of the system count errors of the rig, too. In the system a camera that stands keeps its pose: its "
+        "images have the same errors again. Here their noise is new in each frame, and is not averaged.\n"
+    )
     show(arguments.out / "table.json", HEADER, worst_of_starts(runs), 2)
     draw([run for run in runs if run.pixels == "stereo"], arguments.out / "startup.png")
     return 0

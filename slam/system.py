@@ -237,19 +237,23 @@ class StereoSlam:
         return named_failures(place, self.backend, self.frontend)
 
     def _step(
-        self, state: State, features: StereoFeatures, begun: Prediction | None = None
+        self, state: State, features: StereoFeatures, repeated: bool, begun: Prediction | None = None
     ) -> tuple[Step, Atlas] | Elsewhere:
         """The way of a frame from its features, as measured, to the map, beside the state before the frame.
 
+        Images that come again, `repeated` byte for byte or compressed anew, show nothing that was not measured before.
         `begun` is the prediction of a back end that takes over in this frame, at a pose that is believed.
         """
         stage, t = self._stages.stage, self._tracker
         with stage("predict"):  # the motion model advances the camera's pose (paper A, Eq. 11), unless it stands
             standing, prediction = (state.standing, begun) if begun else t.predict(state, features)
+            if not begun and t.came_again(state, standing, prediction):
+                repeated, features, standing = True, _nothing_of(features), standing.unseen()
         with stage("associate"):  # correct features, find landmarks (paper A, IV): `slam.tracks.localizer`
             step = t.associate(state, features, standing, prediction)
             if isinstance(step, Elsewhere):  # a kidnapped camera, found elsewhere in the map: `slam.session`
                 return step
+            step = changed(step, repeated=repeated)
         with stage("update"):  # the landmarks' pixels correct pose and map
             step = t.update(state, step)
             if isinstance(step, Elsewhere):  # the place is unknown: a new map begins, see `slam.session`
@@ -277,22 +281,19 @@ class StereoSlam:
                 tracker.advanced = features.stamp
                 return out(result)
             state = located
-        # Images that come again, byte for byte, show nothing that was not measured before.
         repeated = len(features) > 0 and checksum is not None and checksum == state.checksum
-        if repeated:
-            features = StereoFeatures.empty(features.stamp, features.descriptors.shape[1], features.threshold)
+        features = _nothing_of(features) if repeated else features
         with self._stages.stage("predict"):
             revision = tracker.revise(state)
-        done = self._step(state, features)
+        done = self._step(state, features, repeated)
         if isinstance(done, Elsewhere):  # another back end begins there, in the map or in a new one
             state, begun = session.taken_over(state, done, features)
             self.objects.restart()
-            done = self._step(state, features, begun)
+            done = self._step(state, features, repeated, begun)
             assert not isinstance(done, Elsewhere)  # a back end that takes over is believed
         step, atlas = done
         if state is not self._state:
             step = session.with_takeover(self._state, state, step)
-        step = changed(step, repeated=repeated)
         common = tracker.rig_error.common(state.backend, as_reported=True)
         result = frame_result(step, atlas, state.ever_mapped, revision, self._stages.milliseconds, common)
         self._moment.add(features, step.estimate.T_world_left, result.status.measured)
@@ -360,3 +361,8 @@ class StereoSlam:
         """State for copying and pickling; refused while another thread is in a step."""
         with self._stepping:
             return vars(self).copy()
+
+
+def _nothing_of(features: StereoFeatures) -> StereoFeatures:
+    """No features, at the same time and of the same front end."""
+    return StereoFeatures.empty(features.stamp, features.descriptors.shape[1], features.threshold)

@@ -40,7 +40,7 @@ from slam.interfaces import AligningFrontend, Backend, Frontend, MapBackend, Res
 from slam.object_data import MovingObject
 from slam.third_party import OnlinePose, checked, recent_of
 from slam.tracks.alignment import align, take_patches
-from slam.tracks.localizer import Localizer, Search, median_deviation
+from slam.tracks.localizer import Localizer, Search, jump, median_deviation
 from slam.tracks.mapper import Mapper
 from slam.tracks.standing import Standing
 from slam.tracks.step import HIDDEN, LandmarkMatches, Step, TrackingState
@@ -76,9 +76,10 @@ class State:
     def after(self, step: Step, atlas: Atlas, checksum: tuple[int, int] | None) -> State:
         """The state after one more frame."""
         located = not step.tracking.unmeasured or not self.ever_mapped or self.begins_at(step.index)
+        seen_at = self.standing.T_world_left if step.repeated else step.estimate.T_world_left
         return changed(
             self, tracks=step.tracks, atlas=atlas, index=step.index, tracking=step.tracking, online=step.online,
-            standing=changed(step.standing, T_world_left=step.estimate.T_world_left),
+            standing=changed(step.standing, T_world_left=seen_at),
             checksum=checksum, ever_mapped=self.ever_mapped or len(step.added) > 0,
             dimensions=step.features.descriptors.shape[1] if len(step.features) else self.dimensions,
             measured_at=step.features.stamp if located else self.measured_at,
@@ -140,6 +141,12 @@ class Tracker:
         prediction: Prediction = checked(state.backend, "predict", ask(features.stamp))
         self.advanced = features.stamp
         return standing, prediction
+
+    def came_again(self, state: State, standing: Standing, prediction: Prediction) -> bool:
+        """Whether the images are earlier ones, compressed anew: features stay, as of a stop that no camera makes."""
+        c = self.config.association
+        farthest = c.lost_jump if state.tracking.unmeasured else c.max_jump
+        return standing.frames > 0 and jump(prediction, standing.T_world_left) > farthest
 
     def associate(
         self, state: State, features: StereoFeatures, standing: Standing, prediction: Prediction

@@ -36,8 +36,10 @@ class Fault(NamedTuple):
 
     @property
     def tests(self) -> str:
-        """The tests nearest to it."""
-        return next(tests for start, tests in NEAREST.items() if self.file.startswith(start))
+        """The tests nearest to it, those of the file first."""
+        tests = next(tests for start, tests in NEAREST.items() if self.file.startswith(start))
+        own = f"{tests}/test_{Path(self.file).stem}.py"
+        return f"{own} {tests}" if (ROOT / own).exists() else tests
 
 
 #: By how a file's path begins: the tests nearest to it.

@@ -22,8 +22,8 @@ class EkfConfig:
 
     Attributes:
         papers: closest to the papers' filter: the left pixel alone, one linearisation, landmarks in the world, a
-            covariance that is not transported, features that do not slide. No other option may be set then. What
-            stays is the gate by what all others predict, the outlier test, and the recovery.
+            covariance that is not transported, features that do not slide. No other option may be set then. What stays
+            is the outlier test with readmission, the recovery, what a long gap does, and the angles' own world.
         measurement: ``"stereo"`` measures (uL, vL, uR), ``"left"`` the left pixel alone, as the papers do (paper A, V).
         iterations: most linearisations in an update; 1 is the papers' filter (paper A, Eq. 11). More are made only in
             updates where the first is not linear to within the noise.

@@ -151,22 +151,23 @@ class Covariance:
         The last poses keep the covariance that they have among themselves.
 
         Args:
-            V: (n, ·) and
-            U: (n, ·) with ``K S Kᵀ = V Vᵀ − U Uᵀ``.
+            V: ``K S Kᵀ = V Vᵀ − U Uᵀ`` (n, ·).
+            U: see V (n, ·).
             by_rig: what errors of the rig change in the update (n, m), as derivatives.
-            J: the camera's error becomes J (12, 12) times what it was,
-            shift: and then to those of the landmarks this (N, 3, 6) times that of the pose is added.
+            J: the corrected camera's error is J (12, 12) times that of the camera before.
+            shift: the error of a corrected landmark is what it was plus its shift (N, 3, 6) times that of the pose.
         """
-        last, by_rig, M = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), CAMERA))
+        last, by_rig, D = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), CAMERA))
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
         P = dsyrk(1.0, U, 1.0, P.T, overwrite_c=1).T if U.size else P
         mirror(P[:CAMERA, :CAMERA])
-        M[:CAMERA], M[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
-        half = 0.5 * M @ P[:CAMERA, :CAMERA]  # T = 1 + [M, 0]:  T P Tᵀ = P + M Yᵀ + Y Mᵀ,  Y = P[:, :12] + M P_cc / 2
-        P = dsyr2k(1.0, M, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
-        by_rig += M @ by_rig[:CAMERA]
+        D[:CAMERA], D[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
+        # with T = 1 + [D, 0]: T P Tᵀ = P + D Yᵀ + Y Dᵀ,  Y = P[:, :12] + D P_cc / 2
+        half = 0.5 * D @ P[:CAMERA, :CAMERA]
+        P = dsyr2k(1.0, D, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
+        by_rig += D @ by_rig[:CAMERA]
         P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]
-        summands = self.P.diagonal() + 2 * (half * M).sum(axis=1)
+        summands = self.P.diagonal() + 2 * (half * D).sum(axis=1)
         summands[last] = 0.0
         mirror(P)
         return replace(self, P=positive(P, summands, V.shape[1]), by_rig=by_rig)

@@ -35,7 +35,7 @@ from slam.bodies.track_kernels import displaced
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among, quantile
-from slam.geometry.rig import measurement_rows
+from slam.geometry.rig import MINIMAL_POINTS, measurement_rows
 from slam.geometry.se3 import Array, hat, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
 
@@ -130,11 +130,12 @@ def limit(test: float, size: IndexArray | int) -> Array:
     return test * (1.0 + _TAIL / np.maximum(size, 1.0))
 
 
-def classify_scene(moved: Displacements, place: Array, test: float) -> Scene:
+def classify_scene(moved: Displacements, place: Array, test: float, least: int = MIN_POINTS) -> Scene:
     """Groups of tracks that moved on their own, and every track's displacement against the rest.
 
-    Tracks are seen at `place` (N, 3): x/z, y/z, log z; `test` is the χ²(6) from which a large group moved. Every χ² is
-    divided by the ratio of the rest's median to what it should be, if that is more than 1.
+    Tracks are seen at `place` (N, 3): x/z, y/z, log z; `test` is the χ²(6) from which a large group moved, and a group
+    has `least` tracks. Every χ² is divided by the ratio of the rest's median to what it should be, if that is more
+    than 1.
     """
     n = len(moved.d)
     if n < 3 * MIN_POINTS:
@@ -142,9 +143,7 @@ def classify_scene(moved: Displacements, place: Array, test: float) -> Scene:
     sums = kernels.normal_equations(moved.points, moved.d, moved.W, moved.lag)
     asked = limit(test, np.arange(n + 1, dtype=np.intp))
     codes = np.sort(kernels.window_codes(place, _SIZES), axis=1)
-    group, values, alone, common, information, scale = kernels.groups_apart(
-        sums, place, codes, _SIZES, asked, MIN_POINTS
-    )
+    group, values, alone, common, information, scale = kernels.groups_apart(sums, place, codes, _SIZES, asked, least)
     heavier = tail(alone[group < 0])  # of what is in no group: before, other groups would be part of it
     groups = [
         Group(np.flatnonzero(group == k), value / heavier, moved, common) for k, value in enumerate(values.tolist())
@@ -268,7 +267,8 @@ def parting(
 ) -> IndexArray:  # fmt: skip
     """Those of the landmarks `at` (K,), seen as features `rows`, that part from the rest of them.
 
-    The camera was at `eyes` (W, 3) in the window's frames. In a run's first frames single ones part, too, and however
+    The camera was at `eyes` (W, 3) in the window's frames. Three are enough: of a body near the camera that begins to
+    move, as many of its landmarks carry the camera along. In a run's first frames single ones part, too, and however
     many: what moves from the beginning on would else pull the camera along, and the world's axes with it.
     """
     t, free, slot = tracks, tracks.body[at] < 0, now % WINDOW
@@ -287,7 +287,7 @@ def parting(
     precise = A[k] / _PRECISE**2, p[k], dof[k], np.arange(len(k))
     moved = Displacements(rays, *displaced(*precise, ages, 1, rays, eyes, setup.slide))
     view = places_in_view(local)
-    scene = classify_scene(moved, view[k], setup.config.suspect)
+    scene = classify_scene(moved, view[k], setup.config.suspect, MINIMAL_POINTS)
     if now < WINDOW:
         return at[k[~scene.rest | (scene.alone > kernels.FITS * tail(scene.alone[scene.rest]))]]
     if (~scene.rest).sum() > kernels.LARGEST * len(k):  # it is rather the poses before that were wrong

@@ -10,7 +10,7 @@ import numpy as np
 
 from slam.bodies.config import CLEAR
 from slam.chi_square import chi_square_limit
-from slam.kernels.linear import factorise, solve_factorised, square
+from slam.kernels.linear import factorise, median, solve_factorised, square
 from slam.kernels.se3 import point_by_motion
 from slam.runtime.compilation import disjoint_helper, helper, kernel
 
@@ -219,7 +219,7 @@ def _gain(triangle, gradient, factor, work):
 
 
 @helper
-def _window_tests(windows, sums, columns, alone, scale, rest, asked, support, largest, clear):
+def _window_tests(starts, tracks, sums, columns, alone, scale, rest, asked, support, largest, clear):
     """By how much the χ²(6) of every window exceeds what is asked, into `clear` (M,); −∞ where it does not.
 
     The test is whether the tracks inside move as the rest; `asked` (N + 1,) is by their number. It is what both gain by
@@ -227,7 +227,7 @@ def _window_tests(windows, sums, columns, alone, scale, rest, asked, support, la
     gain is at most the χ² of those inside against ξ, and both together at most the first over 1 − ρ: of the information
     on any motion those inside have no more than ``ρ = tr(Λ⁻¹ Λ_w)``. Most windows need no more than these sums.
     """
-    n, (starts, tracks, _, _) = len(alone), windows
+    n = len(alone)
     total, weight, off, hold = np.zeros(28), np.zeros(n), np.empty(n), np.empty(n)
     for m in range(n):
         if rest[m]:
@@ -280,54 +280,54 @@ def _window_tests(windows, sums, columns, alone, scale, rest, asked, support, la
 
 
 @helper
-def _next_group(windows, clear, sums, columns, place, scale, asked, support, rest, rows):
-    """The group of the clearest window that has one: its tracks, marked in `rows` (N,), their number, and its χ²(6)."""
-    n, (starts, tracks, centres, widths) = len(sums), windows
-    seeds, doubted, members, every = np.empty(n, np.bool_), ~rest, np.empty(n, np.intp), np.ones(n, np.bool_)
-    motion, apart, fits = np.empty(6), np.empty(n), np.empty(n)
-    for _ in range(_MOST):
-        window = np.argmax(clear)
-        if clear[window] <= 0:
-            break
-        inside, found = 0, 0
-        seeds[:] = False
-        for m in tracks[starts[window] : starts[window + 1]]:
-            seeds[m] = not doubted[m]
-            inside += rest[m]
-            found += seeds[m]
-        value, clear[window] = clear[window] + asked[inside], -np.inf
-        if found < support:
-            continue
-        for m in range(n):
-            rows[m] = rest[m] and not seeds[m]
-        _common_motion(sums, columns, rows, motion)
-        _squares_against(columns, motion, apart)
-        for m in range(n):  # a slice would make Numba compile messages about shapes, for two seconds
-            rows[m] = seeds[m]
-        for _ in range(2):
-            if found < support:
-                break
-            count = 0
+def _seeds(own, rest, doubted, seeds):
+    """Which of a window's `own` tracks no group was sought from in vain, into `seeds` (N,).
+
+    How many, and how many of its tracks are of the rest.
+    """
+    size = inside = 0
+    seeds[:] = False
+    for m in own:
+        seeds[m] = not doubted[m]
+        size += seeds[m]
+        inside += rest[m]
+    return size, inside
+
+
+@helper
+def _company(sums, columns, place, centre, width, scale, rest, seeds, support, rows):
+    """Tracks of the rest near a window that move as its `seeds` (N,) do, into `rows` (N,); how many.
+
+    The search ends below `support`.
+    """
+    n, found = len(sums), 0
+    members, every = np.empty(n, np.intp), np.ones(n, np.bool_)
+    motion, apart, fits = np.empty(6), np.zeros(n), np.zeros(n)
+    for m in range(n):
+        rows[m] = rest[m] and not seeds[m]
+    for which in range(3):  # of the others, the seeds, and those that go with these; compiled once for all
+        count, own, own_columns, chosen = 0, sums, columns, rows
+        if which:
             for m in range(n):
                 if rows[m]:
                     members[count] = m
                     count += 1
-            _common_motion(*_by_column(sums, members, count), every, motion)
-            _squares_against(columns, motion, fits)
-            found = 0
-            for m in range(n):
-                one, other = fits[m] / scale, apart[m] / scale
-                rows[m] = rest[m] and one < max(FITS, _EXPLAINED * other)
-                rows[m] = rows[m] and other - one > (_BETTER if seeds[m] else CLEAR)
-                for axis in range(3):
-                    off = abs(place[m, axis] - centres[window, axis])
-                    rows[m] = rows[m] and off < (0.5 + _AROUND) * widths[window, axis]
-                found += rows[m]
-        if found >= support:
-            return found, value
+            own, own_columns = _by_column(sums, members, count)
+            chosen = every
+        _common_motion(own, own_columns, chosen, motion)
+        _squares_against(columns, motion, fits if which else apart)
+        found = 0
         for m in range(n):
-            doubted[m] = doubted[m] or seeds[m]
-    return 0, 0.0
+            one, other = fits[m] / scale, apart[m] / scale
+            goes = rest[m] and one < max(FITS, _EXPLAINED * other)
+            goes = goes and other - one > (_BETTER if seeds[m] else CLEAR)
+            for axis in range(3):
+                goes = goes and abs(place[m, axis] - centre[axis]) < (0.5 + _AROUND) * width[axis]
+            rows[m] = goes if which else seeds[m]
+            found += rows[m]
+        if found < support:
+            break
+    return found
 
 
 @kernel
@@ -342,22 +342,43 @@ def groups_apart(sums, place, codes, sizes, asked, support):
     """
     n = len(sums)
     _, columns = _by_column(sums, np.arange(n), n)
-    windows = _full_windows(codes, sizes, support)
-    clear = np.empty(len(windows[0]) - 1)
+    starts, tracks, centres, widths = _full_windows(codes, sizes, support)
+    clear = np.empty(len(starts) - 1)
     group, values, common, alone = np.full(n, -1), np.empty(n), np.empty(6), np.empty(n)
-    rest, rows = np.ones(n, np.bool_), np.empty(n, np.bool_)
+    rest, rows, kept = np.ones(n, np.bool_), np.empty(n, np.bool_), np.empty(n)
+    seeds, doubted = np.empty(n, np.bool_), np.zeros(n, np.bool_)
     groups, left = 0, n
     while True:
         _common_motion(sums, columns, rest, common)
         _squares_against(columns, common, alone)
-        scale = max(1.0, np.median(alone[rest]) / MEDIAN)
+        count = 0
+        for m in range(n):
+            if rest[m]:
+                kept[count] = alone[m]
+                count += 1
+        scale = max(1.0, median(kept[:count]) / MEDIAN)
         for m in range(n):
             alone[m] /= scale
+            doubted[m] = not rest[m]
         if 3 * left < n or len(clear) == 0:
             break
-        _window_tests(windows, sums, columns, alone, scale, rest, asked, support, LARGEST * left, clear)
-        found, value = _next_group(windows, clear, sums, columns, place, scale, asked, support, rest, rows)
-        if found == 0:
+        _window_tests(starts, tracks, sums, columns, alone, scale, rest, asked, support, LARGEST * left, clear)
+        found, value = 0, 0.0
+        for _ in range(_MOST):
+            window = np.argmax(clear)
+            if clear[window] <= 0:
+                break
+            size, inside = _seeds(tracks[starts[window] : starts[window + 1]], rest, doubted, seeds)
+            value, clear[window] = clear[window] + asked[inside], -np.inf
+            if size < support:
+                continue
+            at, wide = centres[window], widths[window]
+            found = _company(sums, columns, place, at, wide, scale, rest, seeds, support, rows)
+            if found >= support:
+                break
+            for m in range(n):
+                doubted[m] = doubted[m] or seeds[m]
+        if found < support:
             break
         for m in range(n):
             if rows[m]:

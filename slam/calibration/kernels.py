@@ -7,7 +7,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import assign, column_times, factorise, invert_symmetric, row_times, solve_factorised, square
+from slam.kernels.linear import (
+    assign,
+    column_times,
+    factorise,
+    invert_symmetric,
+    median,
+    row_times,
+    solve_factorised,
+    square,
+)
 from slam.kernels.se3 import exp
 from slam.runtime.compilation import helper, kernel
 
@@ -85,11 +94,11 @@ def residual_field(points, focal, centre, half, degrees):
 
 
 @kernel
-def fit(first, second, R, t, focal, noise, median, steps):
+def fit(first, second, R, t, focal, noise, typical, steps):
     """Gauss-Newton of `slam.calibration.pairs.fit_motion`, of some steps at most; see there for the arguments.
 
     Without any, the problem is linearised at the first guess. Points are weighted by Student's t distribution of four
-    degrees of freedom, `median` being that of χ². Returns what `slam.calibration.pairs.Fit` has, and the last
+    degrees of freedom, `typical` being the median of χ². Returns what `slam.calibration.pairs.Fit` has, and the last
     change of a predicted point [px], infinite where there is no solution.
     """
     n, last = len(first), np.inf
@@ -107,8 +116,9 @@ def fit(first, second, R, t, focal, noise, median, steps):
             last = np.inf
             break
         # 0.2: no less than a fifth of the configured noise
-        scale = max(np.median(weights) / median, 0.2 * 0.2)
-        weights[:] = 7.0 / (4.0 + weights / scale) / scale
+        scale = max(median(weights.copy()) / typical, 0.2 * 0.2)
+        for p in range(n):
+            weights[p] = 7.0 / (4.0 + weights[p] / scale) / scale
         _solve(*at[2:], weights, step)
         exp(step, turn)
         assign(R, before)

@@ -22,7 +22,7 @@ from slam.tracks.step import ENOUGH_FEATURES
 logger = logging.getLogger("slam.input")
 
 #: Why a frame is no measurement though its images show enough.
-REPEATED = "the images are those of the frame before, byte for byte"
+REPEATED = "the images are those of the frame before"
 
 #: guard: plausible times between frames [s]: a thousand frames a second to one in ten seconds.
 SHORTEST, LONGEST = 1e-3, 10.0
@@ -245,8 +245,8 @@ class InputWarnings:
         """Warn of a frame with the images of the frame before, by its number in its sequence."""
         if not self.repeated:
             self.repeated = (
-                f"frame {number}: {REPEATED}: the camera froze or its driver gave them twice; such frames are no "
-                "measurements (simulated images need noise)"
+                f"frame {number}: {REPEATED}: the camera froze, or its driver or a video's frame rate gave them twice; "
+                "such frames are no measurements (simulated images need noise)"
             )
             logger.warning("%s", self.repeated)
 

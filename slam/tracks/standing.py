@@ -72,7 +72,8 @@ class Standing:
     # rows of the present features that stay (M,); meaningful if the camera stands
     witnesses: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     variance: float = np.inf  # of a pixel of a feature that stays [px²], as seen so far; infinite before anything was
-    T_world_left: Array = field(default_factory=lambda: np.eye(4))  # the camera's last pose (4, 4)
+    # the camera's pose (4, 4) in the last frame whose images were new
+    T_world_left: Array = field(default_factory=lambda: np.eye(4))
     blind: int = 0  # number of frames in which too little of what stays was seen to tell, as something hides it
 
     @cached_property
@@ -123,6 +124,10 @@ class Standing:
         landmarks, witnesses = (_moved_share(rig, sigma, features, rows, motion) for rows in (matched, self.witnesses))
         # 0.1: share of landmarks that a motion must move, for it to be one
         return self.moving() if landmarks > 0.1 and witnesses < 0.5 else self
+
+    def unseen(self) -> Standing:
+        """After a frame whose features are left out, as its images are earlier ones."""
+        return changed(self, frames=0, witnesses=self.witnesses[:0])
 
     def moving(self) -> Standing:
         """The same features, of a camera that does not stand."""

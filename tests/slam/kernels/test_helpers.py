@@ -27,6 +27,17 @@ def filled(helper, *arguments, shape):
     return out
 
 
+def test_median():
+    """Of all small numbers of values, many of them equal."""
+    from numba import njit
+
+    helper, rng = linear.median, np.random.default_rng(3)
+    median = njit(lambda values: helper(values))
+    for n in range(1, 40):
+        numbers = rng.normal(size=n).round(1)
+        assert median(numbers.copy()) == np.median(numbers)
+
+
 def test_whitening():
     rng = np.random.default_rng(3)
     C, g = positive(3, rng), rng.normal(size=3)

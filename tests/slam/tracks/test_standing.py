@@ -173,11 +173,6 @@ def test_people_who_walk_by_hardly_move_the_camera(slam_data, backend):
 ROWS = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
 
 
-def joined(a, keep_a, b, keep_b):
-    """Features of two frames, some of each."""
-    return replace(a, **{n: np.concatenate([getattr(a, n)[keep_a], getattr(b, n)[keep_b]]) for n in ROWS})
-
-
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])
 def test_a_camera_that_something_large_took_along_comes_back(backend):
     """It stands; something passes, covers all of its view for a second, and moves by more than a metre meanwhile."""
@@ -190,7 +185,9 @@ def test_a_camera_that_something_large_took_along_comes_back(backend):
         there, _ = mover.features(se3.exp(np.array([0, 0, 0, -0.04 * (k - 10), 0, 0])), k / 30, 0.3)
         edge = 14.0 * (k - 20)
         covered = [(f.uv_left[:, 0] < edge) & (f.uv_left[:, 0] > edge - 520) for f in (here, there)]
-        results.append(system.process_features(joined(here, ~covered[0], there, covered[1])))
+        a, b = here.select(~covered[0]), there.select(covered[1])
+        features = replace(a, **{name: np.concatenate([getattr(a, name), getattr(b, name)]) for name in ROWS})
+        results.append(system.process_features(features))
     off = [float(np.linalg.norm(r.estimate.T_world_left[:3, 3])) for r in results]
     assert max(off) > 0.3  # taken along: that it is, others see to
     sigmas = [float(np.sqrt(np.trace(r.estimate.covariance[3:, 3:]))) for r in results]

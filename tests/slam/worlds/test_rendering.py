@@ -1,11 +1,66 @@
+"""The renderer, on a world with a board of known corners."""
+
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import pytest
 
-from slam.worlds import open_world
+from slam.worlds import WorldSequence, open_world
+from slam.worlds.geometry import Parts, rectangle
 from slam.worlds.observe import visible_landmarks
+from slam.worlds.scenes import assemble
+from slam.worlds.world import Scene
+
+
+@dataclass(frozen=True)
+class Checkers:
+    """A chess board; its marks are the corners of its fields."""
+
+    width: float
+    height: float
+    step: float
+
+    def marks(self) -> np.ndarray:
+        x = np.arange(self.step, self.width - 0.01, self.step)
+        y = np.arange(self.step, self.height - 0.01, self.step)
+        grid_x, grid_y = np.meshgrid(x, y)
+        return np.stack([grid_x.ravel(), grid_y.ravel(), np.full(grid_x.size, self.step)], axis=1)
+
+    def paint(self, density: float) -> np.ndarray:
+        rows = self._wave(round(self.height * density), self.height)
+        columns = self._wave(round(self.width * density), self.width)
+        picture = np.rint(130 + 90 * rows[:, None] * columns).astype(np.uint8)
+        return np.repeat(picture[..., None], 3, axis=2)
+
+    def _wave(self, texels: int, length: float) -> np.ndarray:
+        """A square wave averaged over each texel: a chess board is the product of two."""
+        fine = (np.arange(texels * 256) + 0.5) / (texels * 256) * length
+        return (1 - 2 * (np.floor(fine / self.step) % 2)).reshape(texels, 256).mean(axis=1)
+
+
+@pytest.fixture(scope="session")
+def board_world() -> Callable[..., WorldSequence]:
+    """Makes recordings, along the aisle's path, of three walls painted with chess boards, one of them turned away."""
+
+    def make(query: str, step: float) -> WorldSequence:
+        base = open_world(f"aisle?{query}")
+        board = Checkers(2.0, 2.0, step)
+        walls = [
+            rectangle(board, (-0.6, 1.1, 2.3), (1, 0, 0), (0, 0, -1)),
+            rectangle(board, (1.4, 1.1, 2.3), (0.8, 0.6, 0), (0, 0, -1)),
+            rectangle(board, (3.0, 2.3, 2.3), (1, -0.3, 0), (0, 0, -1)),
+        ]
+        w = base.world
+        values = {**base.values, "density": 1e4}
+        parts = Parts(w.stamps, w.T_world_left, walls)
+        scene = Scene("boards", lambda _: parts, (0.3, 3.5), 640.0)
+        return WorldSequence("board", assemble("board", scene, values, parts), values)
+
+    return make
 
 
 def saddle(image: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -23,11 +78,6 @@ def saddle(image: np.ndarray, start: np.ndarray) -> np.ndarray:
     return place
 
 
-def smoothed(image: np.ndarray) -> np.ndarray:
-    """An image whose edges are smooth enough for `saddle`."""
-    return cv2.GaussianBlur(image.astype(np.float32), (0, 0), 2.0)
-
-
 def corner_errors(sequence, frames) -> np.ndarray:
     """Rendered minus projected corners (N, 2) [px], left and right, of fields at least 22 px wide seen from before."""
     errors = []
@@ -38,7 +88,7 @@ def corner_errors(sequence, frames) -> np.ndarray:
         facing = -(world.landmarks.normals[seen.ids] * offset).sum(axis=1) / np.linalg.norm(offset, axis=1)
         clear = (seen.size > 22) & (facing > 0.5)
         for image, uv, camera in ((frame.left, seen.uv_left, rig.left), (frame.right, seen.uv_right, rig.right)):
-            smooth = smoothed(image)
+            smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 2.0)  # enough for `saddle`
             places = uv[clear & camera.in_image(uv, 12)]
             errors += [saddle(smooth, place) - place for place in places]
     return np.array(errors)
