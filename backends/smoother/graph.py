@@ -135,8 +135,9 @@ class Graph:
             self._taken = len(s.sights[s.of(number)])
         kept = self._tracks.keep(problem, s)
         made = self._tracks.make_smart(problem, s.number < self._careful)
-        # Two steps of Gauss and Newton: in the first no time passes, so nothing leaves. What leaves fixes where its
-        # neighbours stay linearised, and that is to be after the newest pose is solved for.
+        # Two steps of Gauss and Newton. gtsam's clock is the newest stamp: in the first step it stands, so nothing
+        # leaves. What leaves fixes where its neighbours stay linearised, and that is to be after the newest pose is
+        # solved for.
         now: Stamps = dict.fromkeys(problem.values.keys(), float(s.ages[s.of(numbers.start)] - 1))
         with solving():
             self._solver.update(problem.factors, problem.values, now, problem.removed)
@@ -211,7 +212,7 @@ class Graph:
 
 
 def _kind(s: SmootherState) -> tuple[bool, int]:
-    """What a graph cannot follow: that landmarks become known in the world, and that measurements are revised."""
+    """What a graph is built for: whether landmarks are known in the world, and which revision of the measurements."""
     return s.anchored, s.revisions
 
 

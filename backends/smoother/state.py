@@ -57,7 +57,7 @@ class SmootherState:
     poses: Array  # T_world_left (K, 4, 4)
     stamps: Array  # their times (K,) [s]
     rests: BoolArray  # whether the camera rested since the pose before (K,)
-    ages: IndexArray  # how many poses up to each (K,) gave the graph anything: others take no part of the lag
+    ages: IndexArray  # how many poses up to each (K,) gave the graph anything: the lag is counted in these
     sights: tuple[Sight, ...]  # what the graph is given of each
     spread: Array  # covariance in the world of each when it was the newest that was solved for (K, 6, 6)
     pair: Array  # joint covariance (12, 12) of the errors of the last two poses relative to the anchor

@@ -93,12 +93,12 @@ class Tracks:
 
     def add_rows(self, problem: GraphProblem, s: SmootherState, number: int, first: int, begin: int = 0) -> None:
         """What was measured from a pose, from some row on."""
-        sight, make, known = s.sights[s.of(number)], self._make, bool(s.known or self._variables)
+        sight, make, some = s.sights[s.of(number)], self._make, bool(s.known or self._variables)
         key = pose_key(number)
         rows = (column[begin:].tolist() for column in (sight.serials, sight.factor, sight.z))
         for serial, factor, z in zip(*rows):
             point = make.point(z)
-            if known and self._is_variable(problem, s, serial, factor, number, first):
+            if some and self._is_variable(problem, s, serial, factor, number, first):
                 self._stays(problem, s, serial, number)
                 problem.factors.add(make.explicit(point, number, serial))
                 continue
@@ -190,7 +190,7 @@ class Tracks:
     def forget(self, s: SmootherState, oldest: int) -> None:
         """After its newest pose was solved for: forget what will not grow or come back; once in a while.
 
-        Of a landmark of which more is known it stays known that this is used up.
+        A landmark that was known beforehand stays listed, so that this is not told the graph again.
         """
         self._oldest = oldest
         if self._lag is not None and not s.number % self._lag:
