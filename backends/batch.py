@@ -1,14 +1,13 @@
 """The maximum-likelihood estimate from all measurements, by Levenberg-Marquardt: the reference for back ends.
 
-Every frame is a variable, every landmark that its measurements determine, and every measurement of one that the
-smoother accepted a factor of its own; the motion model ties three successive frames. Left out are landmarks that were
-seen once, with a disparity below a pixel, and what was before the problem began anew.
+Every frame is a variable, every landmark that was measured with a disparity, and every measurement of one that the
+smoother accepted a factor of its own; the motion model ties three successive frames. What was before the problem began
+anew is left out.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -16,22 +15,23 @@ import gtsam
 import numpy as np
 
 from backends.smoother import SmootherBackend
-from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
-from backends.smoother.graph import SolverError, minimised, solving
+from backends.smoother.factors import landmark_key, pose_key
+from backends.smoother.graph import SolverError, by_pose, held, minimised, solving
 from backends.smoother.state import SmootherState
 from backends.smoother.tracks import GraphProblem, Tracks
 from slam.data import Estimate
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, transform
+from slam.geometry.se3 import Array, adjoint, inverse, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
-from slam.window.motion import LONGEST, is_first
 from slam.window.stereo import RectifiedStereo
 
 _ITERATIONS = 100  # numerics: of Levenberg-Marquardt at most
-_DISTINCT = 1.0  # numerics: disparity [px] from which on one sight alone determines a landmark well enough for Cholesky
+#: numerics: standard deviation [m] of a prior on each landmark; without it far ones go to infinity, and leave the
+#: covariance of everything open
+_FARTHEST = 1e4
 
 
 class BatchBackend:
@@ -41,8 +41,9 @@ class BatchBackend:
 
     A smoother runs along: it predicts, gates and gives the first values.
     All but `estimate` and `trajectory` are its own methods (`SmootherBackend`). The problem is solved when the path or
-    the landmarks are asked for; the pose alone is the smoother's. Where gtsam cannot give covariances for the solution,
-    they are the smoother's, too, and a warning is logged.
+    the landmarks are asked for; the pose alone is the smoother's, and so are landmarks that are no variables. Where
+    gtsam gives no covariances (motions of which some are ten thousand times as uncertain as others), the whole estimate
+    is the smoother's, and a warning is logged.
 
     Args:
         rig: the cameras.
@@ -69,20 +70,16 @@ class BatchBackend:
     @one_blas_thread
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
-        rough = self._smoother.estimate(landmarks)
         if not landmarks:
-            return rough
-        solution, s = self._solved(), self._smoother.state
-        positions, covariances = rough.positions.copy(), rough.covariances.copy()
-        serials = s.landmarks.serial[s.landmarks.rows_of(rough.ids)]
-        for row, serial in enumerate(serials.tolist()):
-            if serial in solution.landmarks:
-                positions[row] = solution.values.atPoint3(landmark_key(serial))
-                covariances[row] = solution.covariance(landmark_key(serial), covariances[row])
-            elif serial in solution.once:  # it moves with the pose that measured it
-                positions[row] = transform(solution.once[serial], positions[row : row + 1])[0]
-        T, P = solution.poses[-1].copy(), solution.covariance(solution.newest, rough.covariance)
-        return Estimate(rough.stamp, T, P, rough.ids, positions, covariances)
+            return self._smoother.estimate(landmarks=False)
+        solution = self._solved()
+        try:
+            return solution.estimate(self._smoother)
+        except SolverError as error:
+            logging.getLogger(__name__).warning(
+                "batch: the estimate is the smoother's, as gtsam gives no covariances: %s", error
+            )
+            return self._smoother.estimate()
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
@@ -107,14 +104,12 @@ class _BatchSolution:
     def __init__(self, smoother: SmootherBackend) -> None:
         s, make = smoother.state, smoother.factor_maker
         self.state = s  # what it is the solution for
-        numbers, begin = range(s.begun, s.number + 1), s.of(s.begun)
-        keys = [pose_key(number) for number in numbers]
+        numbers = range(s.begun, s.number + 1)
         problem, tracks = GraphProblem(), Tracks(make, None)
-        problem.factors.add(make.prior(s.begun, s.start, s.prior))
-        for key, T in zip(keys, s.poses[begin:]):
-            problem.values.insert(key, to_pose3(T))
-        for factor in _motions(keys, np.diff(s.stamps[begin:]).clip(max=LONGEST), make):
-            problem.factors.add(factor)
+        prior, self._base = held(s, s.begun)
+        problem.factors.add(make.prior(s.begun, s.start, prior))
+        for number in numbers:
+            tracks.add_pose(problem, s, number, s.begun)
         places = _places(s, make.stereo, numbers)
         known = {serial for serial, one in s.known.items() if one.pose < 0 or one.pose >= s.begun}
         self.landmarks = known.union(places)  # serial numbers of those that are variables
@@ -123,66 +118,51 @@ class _BatchSolution:
                 tracks.add_known(problem, s, serial)
             else:
                 problem.values.insert(landmark_key(serial), places[serial])
+                problem.factors.add(make.known(serial, places[serial], _FARTHEST**2 * np.eye(3)))
         for number in numbers:
             sight = s.sights[s.of(number)]
             for serial, z in zip(sight.serials.tolist(), sight.z.tolist()):
                 if serial in self.landmarks:
                     problem.factors.add(make.explicit(make.point(z), number, serial))
-        self._factors, self.newest = problem.factors, keys[-1]
+        self._factors = problem.factors
         self.values = minimised(problem, _ITERATIONS)
-        self.poses = np.array([self.values.atPose3(key).matrix() for key in keys])  # (F, 4, 4) from its beginning on
-        self.once = self._moved(numbers)
-
-    def _moved(self, numbers: range) -> dict[int, Array]:
-        """How measured landmarks that are no variables move with their pose (4, 4), by serial number."""
-        s = self.state
-        solved = np.array([self.values.atPose3(pose_key(i)).matrix() for i in numbers])
-        moved = solved @ inverse(s.poses[s.of(s.begun) :])
-        return {
-            serial: moved[number - s.begun]
-            for number in numbers
-            for serial in s.sights[s.of(number)].serials.tolist()
-            if serial not in self.landmarks
-        }
+        # (F, 4, 4) from its beginning on
+        self.poses = np.array([self.values.atPose3(pose_key(number)).matrix() for number in numbers])
 
     @cached_property
-    def _marginals(self) -> gtsam.Marginals | None:
-        try:
-            with solving():
-                return gtsam.Marginals(self._factors, self.values)
-        except SolverError as error:
-            logging.getLogger(__name__).warning("batch: covariances are the smoother's, gtsam gives none: %s", error)
-            return None
+    def _marginals(self) -> gtsam.Marginals:
+        return gtsam.Marginals(self._factors, self.values)
 
-    def covariance(self, key: int, otherwise: Array) -> Array:
-        """Marginal covariance of a variable; `otherwise` where the problem leaves one open."""
-        if self._marginals is None:
-            return otherwise
-        try:
-            with solving():
-                return np.asarray(self._marginals.marginalCovariance(key))
-        except SolverError:
-            return otherwise
+    def estimate(self, smoother: SmootherBackend) -> Estimate:
+        """Newest pose and landmarks; SolverError where gtsam gives no covariances."""
+        s, marks = self.state, self.state.landmarks
+        rows = marks.order
+        serials = marks.serial[rows].tolist()
+        positions, covariances = marks.position[rows], np.zeros((len(rows), 3, 3))
+        others = np.array([serial not in self.landmarks for serial in serials], bool)
+        covariances[others] = smoother.landmark_covariances(rows[others])
+        for row in np.flatnonzero(~others).tolist():
+            key = landmark_key(serials[row])
+            positions[row] = self.values.atPoint3(key)
+            covariances[row] = self.covariance(key, by_pose(self.poses[0], positions[row]))
+        T = self.poses[-1].copy()
+        P = self.covariance(pose_key(s.number), adjoint(inverse(T) @ self.poses[0]))
+        return Estimate(float(s.stamps[-1]), T, P, marks.ids[rows], positions, covariances)
+
+    def covariance(self, key: int, by_first: Array) -> Array:
+        """Marginal covariance (n, n) of a variable, which the first pose moves by `by_first` (n, 6); SolverError."""
+        with solving():
+            return np.asarray(self._marginals.marginalCovariance(key) + by_first @ self._base @ by_first.T)
 
 
 def _places(s: SmootherState, stereo: RectifiedStereo, numbers: range) -> dict[int, Array]:
-    """Where landmarks (3,) begin that measurements determine, by serial number: where their nearest sight puts them."""
-    count = np.zeros(s.serials, np.int64)
+    """Where landmarks (3,) with a disparity begin, by serial number: where the sight with the largest one puts them."""
     nearest: dict[int, tuple[float, Array]] = {}  # largest disparity, and where that puts the landmark
     for number in numbers:
         sight, T = s.sights[s.of(number)], s.poses[s.of(number)]
-        count[sight.serials] += 1
         disparity = np.nan_to_num(sight.z[:, 0] - sight.z[:, 2], nan=-1.0)
         places = transform(T, stereo.triangulate(sight.z))
         for serial, d, place in zip(sight.serials.tolist(), disparity.tolist(), places):
             if d > nearest.get(serial, (0.0, place))[0]:
                 nearest[serial] = d, place
-    return {serial: place for serial, (d, place) in nearest.items() if count[serial] > 1 or d > _DISTINCT}
-
-
-def _motions(keys: list[int], dt: Array, make: FactorMaker) -> Iterator[gtsam.NonlinearFactor]:
-    """What ties poses `dt` (N − 1,) [s] apart: velocities differ by white noise; the first one has its own prior."""
-    for i, interval in enumerate(dt.tolist()):
-        before = float(dt[i - 1]) if i else None
-        first = is_first(before, interval)
-        yield make.motion(keys[i if first else i - 1 : i + 2], np.array([before or np.nan, interval]))
+    return {serial: place for serial, (_, place) in nearest.items()}

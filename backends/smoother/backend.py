@@ -17,7 +17,7 @@ from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
 from slam.bounds import from_options
 from slam.checks import known_landmarks, require_guess, require_not_measured, require_recent, require_stamp
-from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport
+from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, RecentPoses, UpdateReport
 from slam.errors import CopyError, MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
@@ -116,7 +116,7 @@ class SmootherBackend:
         s = self._started("estimate")
         marks = s.landmarks
         rows = marks.order if landmarks else marks.order[:0]
-        covariances = self._steps.landmark_covariances(s, self._graph, rows) if len(rows) else np.zeros((0, 3, 3))
+        covariances = self.landmark_covariances(rows)
         T, P = s.poses[-1].copy(), s.spread[-1].copy()
         return Estimate(float(s.stamps[-1]), T, P, marks.ids[rows], marks.position[rows], covariances)
 
@@ -136,6 +136,10 @@ class SmootherBackend:
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: poses that have left the lag are final."""
         return self.path.trajectory()
+
+    def landmark_covariances(self, rows: IndexArray) -> Array:
+        """Covariances (M, 3, 3) in the world of rows of `state.landmarks`."""
+        return self._steps.landmark_covariances(self.state, self._graph, rows)
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 

@@ -22,8 +22,8 @@ class SmootherConfig:
             are measured for longer than a smart factor spans become variables, and keep what it says of them; but only
             while they are linear in space to less than a pixel's noise.
         poses: which frames give the graph their measurements: ``"every"`` one, or, for ``"seen"``, those that measure
-            less than half of the landmarks that the last one did, or come half a factor after it. The others are solved
-            for alone, from the landmarks as they stand; the graph has them by their motion and this solution.
+            no more than half of the landmarks that the last one did, or come half a factor after it. The others are
+            solved for alone, from the landmarks as they stand; the graph has their motion, not their measurements.
         past: number of poses before those of the lag, at least, whose measurements are kept (half as many poses more
             before they are thrown away): where landmarks are seen again, or measurements are mended, they say where
             those are.

@@ -16,6 +16,7 @@ from slam.models import EstimatorModels
 from slam.window.motion import velocity_sigmas
 from slam.window.stereo import RectifiedStereo
 
+_FAR = 5 * 2**0.5  # probability: sigmas of a pixel; noise changes a disparity by more once in a million times
 _Smart = gtsam_unstable.SmartStereoProjectionPoseFactor
 
 
@@ -35,22 +36,28 @@ def to_pose3(T: Array) -> gtsam.Pose3:
     return gtsam.Pose3(gtsam.Rot3(nearest_rotation(T[:3, :3])), T[:3, 3])
 
 
-def _parameters(mode: gtsam.LinearizationMode) -> gtsam.SmartProjectionParams:
+def _parameters(silent: bool) -> gtsam.SmartProjectionParams:
     parameters = gtsam.SmartProjectionParams()
-    parameters.setLinearizationMode(mode)
+    parameters.setLinearizationMode(gtsam.LinearizationMode.HESSIAN)
+    if silent:
+        parameters.setDegeneracyMode(gtsam.DegeneracyMode.ZERO_ON_DEGENERACY)
     return parameters
 
 
 class FactorMaker:
-    """Makes factors for one rig and one set of models."""
+    """Makes factors for one rig and one set of models.
+
+    Attributes:
+        sigma: noise of a pixel [px].
+        far: disparity [px] below which a measurement tells hardly that its landmark is in front of the camera.
+    """
 
     def __init__(self, stereo: RectifiedStereo, models: EstimatorModels) -> None:
-        self.sigma = models.pixel_sigma
+        self.sigma, self.far = models.pixel_sigma, _FAR * models.pixel_sigma
         self.stereo, self.models = stereo, models
         self._K = gtsam.Cal3_S2Stereo(stereo.f, stereo.f, 0.0, stereo.u0, stereo.v0, stereo.baseline)
         self._noise = gtsam.noiseModel.Isotropic.Sigma(3, self.sigma)
-        self._quick = _parameters(gtsam.LinearizationMode.HESSIAN)
-        self._careful = _parameters(gtsam.LinearizationMode.JACOBIAN_SVD)
+        self._strict, self._silent = _parameters(False), _parameters(True)
 
     @cached_property
     def _mono(self) -> tuple[gtsam.Cal3_S2, gtsam.noiseModel.Base]:
@@ -90,15 +97,15 @@ class FactorMaker:
         return gtsam.StereoPoint2(z[0], z[2], z[1])
 
     def smart(
-        self, points: Sequence[gtsam.StereoPoint2], keys: Sequence[int], careful: bool = False
+        self, points: Sequence[gtsam.StereoPoint2], keys: Sequence[int], silent: bool = False
     ) -> gtsam.NonlinearFactor:
         """A landmark eliminated from its measurements, of which two or more are needed and one with a right pixel.
 
-        Both modes give the same information; the careful one takes longer, and does not throw where the landmark lies
-        behind a camera. That gtsam throws is wanted: with the careful mode in every frame, or with factors that fall
-        silent there (``ZERO_ON_DEGENERACY``), a path of a thousand frames of real tracks ran away.
+        Where the measurements put it behind a camera, gtsam throws, or, of a `silent` one, takes it for no information.
+        That is right for a far landmark, which noise alone may put there. Of a near one it says that poses are wrong:
+        with all factors silent a path of a thousand frames of real tracks ran away.
         """
-        factor = _Smart(self._noise, self._careful if careful else self._quick)
+        factor = _Smart(self._noise, self._silent if silent else self._strict)
         factor.add(points, keys, self._K)
         return factor
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -31,7 +32,10 @@ def solving() -> Iterator[None]:
     try:
         yield
     except (RuntimeError, ValueError, LookupError) as error:
-        raise SolverError(f"gtsam: {' '.join(str(error).split())[:200] or type(error).__name__}") from error
+        why = " ".join(str(error).split())[:200] or type(error).__name__
+        if "unknown exception" in why:  # so gtsam says, of a strict factor (`FactorMaker.smart`)
+            why = "a near landmark lies behind a camera that measured it"
+        raise SolverError(f"gtsam: {why}") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +135,9 @@ class Graph:
             self._taken = len(s.sights[s.of(number)])
         kept = self._tracks.keep(problem, s)
         made = self._tracks.make_smart(problem, s.number < self._careful)
-        # Two steps of Gauss and Newton: in the first no time passes, so nothing leaves. What leaves fixes where its
-        # neighbours stay linearised, and that is to be after the newest pose is solved for.
+        # Two steps of Gauss and Newton. gtsam's clock is the newest stamp: in the first step it stands, so nothing
+        # leaves. What leaves fixes where its neighbours stay linearised, and that is to be after the newest pose is
+        # solved for.
         now: Stamps = dict.fromkeys(problem.values.keys(), float(s.ages[s.of(numbers.start)] - 1))
         with solving():
             self._solver.update(problem.factors, problem.values, now, problem.removed)
@@ -166,18 +171,18 @@ class Graph:
         """
         if not self._is_of(s):
             return last, s.spread[s.of(last)]
-        solved, begin = self.number, s.oldest(self._lag, self.number)
-        begin, first = max(begin, min(first, solved - 1)), max(begin, first)
-        P = self._joint(list(range(begin, solved + 1)))
+        oldest, solved = s.oldest(self._lag, self.number), self.number
+        first = max(oldest, first)
+        begin = max(oldest, min(first, solved - 1))  # where the motion goes on, it needs two poses
+        P = self._joint(list(range(begin, min(solved, last) + 1)))
         for number in range(solved + 1, last + 1):
             _, J, noise, _ = s.moved(self._make.models, number)
-            J, columns, aside = J[:, -len(P) :], slice(len(P) - min(len(P), 12), len(P)), s.aside.get(number)
-            if aside is not None and aside.anchor >= begin:
-                J, noise = adjoint(inverse(aside.relative)), aside.own
-                columns = slice(6 * (aside.anchor - begin), 6 * (aside.anchor - begin) + 6)
-            cross = J @ P[columns]
-            own = cross[:, columns] @ J.T + noise
+            J = J[:, -len(P) :]
+            cross = J @ P[-J.shape[1] :]
+            own = cross[:, -J.shape[1] :] @ J.T + noise
             P = np.block([[P, cross.T], [cross, 0.5 * (own + own.T)]])  # what is not symmetric would grow fourfold
+            gain = np.linalg.solve(P[-6:, -6:], P[-6:])  # a pose that was solved for alone is known better
+            P = P + gain.T @ (s.spread[s.of(number)] - P[-6:, -6:]) @ gain
         rows = slice(6 * (first - begin), 6 * (last + 1 - begin))
         return first, P[rows, rows]
 
@@ -186,8 +191,7 @@ class Graph:
         key = landmark_key(serial)
         if not self._is_of(s) or not self._solver.getLinearizationPoint().exists(key):
             return None
-        R = self._first[:3, :3]
-        J = R @ points_by_pose(transform(inverse(self._first), position[None]))[0]
+        J = by_pose(self._first, position)
         R = self._to_state[:3, :3]
         return np.asarray(R @ self._solver.getISAM2().marginalCovariance(key) @ R.T + J @ self._base @ J.T)
 
@@ -208,7 +212,7 @@ class Graph:
 
 
 def _kind(s: SmootherState) -> tuple[bool, int]:
-    """What a graph cannot follow: that landmarks become known in the world, and that measurements are revised."""
+    """What a graph is built for: whether landmarks are known in the world, and which revision of the measurements."""
     return s.anchored, s.revisions
 
 
@@ -226,6 +230,11 @@ def held(s: SmootherState, number: int) -> tuple[Array, Array]:
     return prior, (vectors * values.clip(min=0)) @ vectors.T
 
 
+def by_pose(T: Array, position: Array) -> Array:
+    """Derivatives (3, 6) of a point (3,) in the world that is fixed to a pose T (4, 4)."""
+    return np.asarray(T[:3, :3] @ points_by_pose(transform(inverse(T), position[None]))[0])
+
+
 def minimised(problem: GraphProblem, iterations: int) -> gtsam.Values:
     """The values that fit all factors best, by Levenberg-Marquardt; SolverError if gtsam finds nothing better."""
     parameters = gtsam.LevenbergMarquardtParams()
@@ -234,8 +243,11 @@ def minimised(problem: GraphProblem, iterations: int) -> gtsam.Values:
     parameters.setAbsoluteErrorTol(1e-9)
     with solving():
         before = problem.factors.error(problem.values)
-        values = gtsam.LevenbergMarquardtOptimizer(problem.factors, problem.values, parameters).optimize()
+        optimizer = gtsam.LevenbergMarquardtOptimizer(problem.factors, problem.values, parameters)
+        values = optimizer.optimize()
         after = problem.factors.error(values)
     if not np.isfinite(after) or after > before:
         raise SolverError(f"Levenberg-Marquardt found no solution (error {before:.6g} to {after:.6g})")
+    if optimizer.iterations() >= iterations:
+        logging.getLogger(__name__).warning("Levenberg-Marquardt was stopped after %d iterations", iterations)
     return values

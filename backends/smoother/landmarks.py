@@ -63,10 +63,10 @@ class SmootherLandmarks(LandmarkRows):
         """With one more measurement (M, 3) of some landmarks, from the pose of a number.
 
         A smart factor spans at most `track` poses. Then, or if a landmark was not measured for half as many, it goes on
-        in a new one. If landmarks that were found together all did so at once, the motion model alone
-        would tie that pose to the one before. So the first factor spans fewer, down to half of them, differently for
-        each landmark. After frames that measured nothing many would, all the same: then every other one takes this
-        measurement, too, as long as its first pose has not left the graph, whose newest one is pose `before`.
+        in a new one. If landmarks that were found together all began anew at once, the motion model alone would tie
+        that pose to the one before. So the first factor spans fewer, down to half of them, differently for each
+        landmark. After frames that measured nothing many factors end together all the same: then every other one takes
+        this measurement, too, unless its first pose has left the graph, whose newest one is pose `before`.
 
         What was measured last before pose `oldest` is left out from now on: the camera has drifted. It counts as what
         was known beforehand.

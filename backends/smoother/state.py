@@ -45,16 +45,6 @@ class Known:
 
 
 @dataclass(frozen=True, eq=False)
-class Aside:
-    """A pose that was solved for alone, from the landmarks as they stood."""
-
-    anchor: int  # number of the pose that it is relative to
-    relative: Array  # (4, 4)
-    covariance: Array  # of that, by its measurements (6, 6)
-    own: Array  # and by the motion, too (6, 6)
-
-
-@dataclass(frozen=True, eq=False)
 class SmootherState:
     """The poses of all frames that are kept, by number, and the landmarks.
 
@@ -67,7 +57,7 @@ class SmootherState:
     poses: Array  # T_world_left (K, 4, 4)
     stamps: Array  # their times (K,) [s]
     rests: BoolArray  # whether the camera rested since the pose before (K,)
-    ages: IndexArray  # how many poses up to each (K,) gave the graph anything: others take no part of the lag
+    ages: IndexArray  # how many poses up to each (K,) gave the graph anything: the lag is counted in these
     sights: tuple[Sight, ...]  # what the graph is given of each
     spread: Array  # covariance in the world of each when it was the newest that was solved for (K, 6, 6)
     pair: Array  # joint covariance (12, 12) of the errors of the last two poses relative to the anchor
@@ -80,8 +70,6 @@ class SmootherState:
     turned: Array = field(default_factory=lambda: np.zeros((3, 3)))
     anchor: int = 0  # number of the last pose that gave the graph anything
     solved: int = -1  # number of the newest pose that the graph solved for; −1 for none
-    chosen: int = -1  # number of the last pose whose measurements the graph was given
-    aside: Mapping[int, Aside] = field(default_factory=dict)  # by number: poses that were solved for alone
     landmarks: SmootherLandmarks = field(default_factory=SmootherLandmarks.none)
     serials: int = 0  # number of landmarks so far
     known: Mapping[int, Known] = field(default_factory=dict)  # by serial number
@@ -149,5 +137,4 @@ class SmootherState:
             ages=self.ages[gone:], sights=self.sights[gone:], spread=self.spread[gone:],
             landmarks=self.landmarks.folded(self.first + gone, oldest),
             known={k: one for k, one in self.known.items() if not 0 <= one.pose < self.first + gone},
-            aside={k: one for k, one in self.aside.items() if k >= self.first + gone},
         )  # fmt: skip

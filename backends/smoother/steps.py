@@ -14,7 +14,7 @@ import numpy as np
 from backends.smoother.config import SmootherConfig
 from backends.smoother.graph import Graph, Solved, SolverError
 from backends.smoother.landmarks import VARIABLE, SmootherLandmarks, inverses
-from backends.smoother.state import Aside, Known, Sight, SmootherState
+from backends.smoother.state import Known, Sight, SmootherState
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, points_by_pose, transform
 from slam.window import pose_only
@@ -24,6 +24,7 @@ from slam.window.recovery import Agreement, agreement, unknown_turn, world_covar
 from slam.window.stereo import RectifiedMeasurement, relative_covariance
 
 _DARK = 100  # frames without a measurement after which the problem begins anew: they would be poses of the graph
+_PART = 64  # cost: poses whose joint covariance is wanted at once, and as many before them
 _SAME = 0.5  # share of a pose's landmarks that another one must measure to say nothing new
 _ALONE: tuple[Array, Array] = np.zeros((12, 12)), np.zeros((6, 12))  # `pair` and `shared` of a first pose
 
@@ -130,9 +131,9 @@ class Steps(RectifiedMeasurement):
         marks = replace(marks, by_rig=marks.by_rig.copy())
         own = marks.from_newest[seen]
         marks.by_rig[seen] = _landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
-        known = np.linalg.eigvals(np.linalg.solve(one.information, G.T @ G)).real.min() > 1  # better than the motion
-        if self.config.poses == "seen" and known and self._saw_the_same(s, marks.serial[seen]):
-            return _aside(s, found.T, G.T @ G, by_rig), nis, ""
+        told = np.linalg.eigvals(np.linalg.solve(one.information, G.T @ G)).real.min()  # over what the motion tells
+        if self.config.poses == "seen" and told > 1 and self._saw_the_same(s, marks.serial[seen]):
+            return _alone(s, found.T, G.T @ G, by_rig), nis, ""
         linear = math.sqrt(self.stereo.f / self.models.pixel_sigma)
         marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T, linear)
         marks = marks.measured(seen, z[used], number, self.track, s.oldest(self.config.lag, number), graph.number)
@@ -161,8 +162,10 @@ class Steps(RectifiedMeasurement):
 
     def _saw_the_same(self, s: SmootherState, serials: IdArray) -> bool:
         """Whether the newest pose measured at least half of what the last one in the graph did, not long ago."""
-        near = s.begun <= s.chosen and s.number - s.chosen <= min(self.track // 2, _DARK - 1)
-        return near and np.isin(s.sights[s.of(s.chosen)].serials, serials).mean() >= _SAME
+        if not s.begun <= s.solved or s.number - s.solved > min(self.track // 2, _DARK - 1):
+            return False
+        last = s.sights[s.of(s.solved)].serials
+        return bool(np.isin(last, serials).sum() > _SAME * len(last))
 
     def settled(self, s: SmootherState, solved: Solved) -> SmootherState:
         """The state with what the graph says: the newest pose is the anchor."""
@@ -177,7 +180,7 @@ class Steps(RectifiedMeasurement):
         used = {n: replace(one, used=s.number) for n, one in known.items()}
         s = replace(
             s, poses=poses, pair=pair, shared=shared, spread=spread, landmarks=marks,
-            anchor=s.number, solved=s.number, chosen=s.number,
+            anchor=s.number, solved=s.number,
             known={**s.known, **used} if used else s.known,
         )  # fmt: skip
         lag = self.config.lag
@@ -222,10 +225,19 @@ class Steps(RectifiedMeasurement):
         return replace(s, landmarks=s.landmarks.select(keep))
 
     def landmark_covariances(self, s: SmootherState, graph: Graph, rows: IndexArray) -> Array:
-        """Covariances (M, 3, 3) of landmarks in the world."""
+        """Covariances (M, 3, 3) of landmarks in the world.
+
+        A landmark is carried by the poses that measured it last: of a long path a part at a time is enough.
+        """
         marks, last = s.landmarks, max(s.anchor, s.solved)
-        joint, poses = graph.joint_covariance(s, s.begun, last)[1], s.poses[: s.of(last) + 1]
-        C = marks.covariances(self.stereo, self.models.pixel_sigma, rows, s.first, poses, joint)
+        C, newest = np.zeros((len(rows), 3, 3)), marks.pose[rows].max(axis=1, initial=-1)
+        oldest = s.oldest(self.config.lag, s.number)
+        newest = np.where(newest < 0, last, newest).clip(oldest, last)
+        for begin in range(oldest, last + 1, _PART):
+            here, end = np.flatnonzero((newest >= begin) & (newest < begin + _PART)), min(begin + _PART - 1, last)
+            if len(here):
+                joint, poses = graph.joint_covariance(s, begin - _PART, end)[1], s.poses[: s.of(end) + 1]
+                C[here] = marks.covariances(self.stereo, self.models.pixel_sigma, rows[here], s.first, poses, joint)
         for i in np.flatnonzero(marks.factor[rows] == VARIABLE):
             found = graph.landmark_covariance(s, int(marks.serial[rows[i]]), marks.position[rows[i]])
             C[i] = C[i] if found is None else found
@@ -257,24 +269,22 @@ def _in_world(s: SmootherState, T: Array, shared: Array, own: Array) -> Array:
     return 0.5 * (P + P.T)
 
 
-def _aside(s: SmootherState, T: Array, information: Array, by_rig: Array) -> SmootherState:
+def _alone(s: SmootherState, T: Array, information: Array, by_rig: Array) -> SmootherState:
     """With the newest pose at T (4, 4), by measurements with an information (6, 6) that the graph is not given.
 
-    Its derivatives by errors of the rig are `by_rig` (6, m).
+    Its derivatives by errors of the rig are `by_rig` (6, m). The next poses are not known better by it: their
+    measurements would be taken for independent of these, though the landmarks' errors are the same.
     """
     before = np.linalg.inv(s.own)
     less = before - before @ np.linalg.inv(before + information) @ before
     gain = s.pair[:6, 6:] @ before
     earlier = s.poses[-2] @ exp(gain @ log(inverse(s.poses[-1]) @ T))
-    pair, shared = (P - P[:, 6:] @ less @ s.pair[6:] for P in (s.pair, s.shared))
-    pair = 0.5 * (pair + pair.T)
-    one = Aside(s.anchor, inverse(s.poses[s.of(s.anchor)]) @ T, np.linalg.inv(information), pair[6:, 6:])
-    P = _in_world(s, T, shared[:, 6:], pair[6:, 6:])
+    own, shared = (P - P @ less @ s.own for P in (s.own, s.shared[:, 6:]))
+    P = _in_world(s, T, shared, 0.5 * (own + own.T))
     return replace(
         s, poses=np.concatenate([s.poses[:-2], earlier[None], T[None]]),
-        spread=np.concatenate([s.spread[:-1], P[None]]), pair=pair, shared=shared,
+        spread=np.concatenate([s.spread[:-1], P[None]]),
         by_rig=np.concatenate([s.by_rig[:6] + gain @ (by_rig - s.by_rig[6:]), by_rig]),
-        aside={**s.aside, s.number: one},
     )  # fmt: skip
 
 

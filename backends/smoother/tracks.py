@@ -31,6 +31,7 @@ class Track:
     points: list[gtsam.StereoPoint2] = field(default_factory=list)
     # whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only
     stereo: bool = False
+    far: bool = False  # whether noise alone may put it behind the camera, by one of them
     slot: int = -1  # of the factor in the solver, −1 while there is none
 
     def takes_any(self, first: int) -> bool:
@@ -73,9 +74,6 @@ class Tracks:
         """A pose, and its motion since the one before it, if it is not the first one."""
         if number > first:
             problem.factors.add(self._motion(s, number, first))
-        aside = s.aside.get(number)
-        if aside is not None and aside.anchor >= first:
-            problem.factors.add(self._make.tie(aside.anchor, number, aside.relative, aside.covariance))
         problem.values.insert(pose_key(number), to_pose3(problem.to_graph @ s.poses[s.of(number)]))
         problem.stamps[pose_key(number)] = float(s.ages[s.of(number)])
 
@@ -95,12 +93,12 @@ class Tracks:
 
     def add_rows(self, problem: GraphProblem, s: SmootherState, number: int, first: int, begin: int = 0) -> None:
         """What was measured from a pose, from some row on."""
-        sight, make, known = s.sights[s.of(number)], self._make, bool(s.known or self._variables)
+        sight, make, some = s.sights[s.of(number)], self._make, bool(s.known or self._variables)
         key = pose_key(number)
         rows = (column[begin:].tolist() for column in (sight.serials, sight.factor, sight.z))
         for serial, factor, z in zip(*rows):
             point = make.point(z)
-            if known and self._is_variable(problem, s, serial, factor, number, first):
+            if some and self._is_variable(problem, s, serial, factor, number, first):
                 self._stays(problem, s, serial, number)
                 problem.factors.add(make.explicit(point, number, serial))
                 continue
@@ -114,6 +112,7 @@ class Tracks:
             track.keys.append(key)
             track.points.append(point)
             track.stereo = track.stereo or z[2] == z[2]  # not NaN
+            track.far = track.far or z[0] - z[2] < make.far
             problem.grown[serial, track.poses[0]] = track
             if factor == VARIABLE and track.stereo:
                 self._turn(problem, s, serial, number)
@@ -177,7 +176,7 @@ class Tracks:
             place = transform(problem.to_graph @ s.poses[s.of(known.pose)], known.position[None])[0]
         problem.values.insert(landmark_key(serial), place)
 
-    def make_smart(self, problem: GraphProblem, careful: bool) -> list[tuple[Track, int]]:
+    def make_smart(self, problem: GraphProblem, silent: bool) -> list[tuple[Track, int]]:
         """The smart factors of what grew, and their places in the problem; see `FactorMaker.smart`."""
         made = []
         for track in problem.grown.values():
@@ -185,13 +184,13 @@ class Tracks:
                 if track.slot >= 0:
                     problem.removed.append(track.slot)
                 made.append((track, problem.factors.size()))
-                problem.factors.add(self._make.smart(track.points, track.keys, careful))
+                problem.factors.add(self._make.smart(track.points, track.keys, silent or track.far))
         return made
 
     def forget(self, s: SmootherState, oldest: int) -> None:
         """After its newest pose was solved for: forget what will not grow or come back; once in a while.
 
-        Of a landmark of which more is known it stays known that this is used up.
+        A landmark that was known beforehand stays listed, so that this is not told the graph again.
         """
         self._oldest = oldest
         if self._lag is not None and not s.number % self._lag:

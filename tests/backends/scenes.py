@@ -80,6 +80,14 @@ def scene(
     return Scene(RIG, dt * np.arange(len(poses)), poses, world, observations)
 
 
+def with_far_points(frames: int, speed: float) -> Scene:
+    """A drive at a speed [m/s] past points at 5 to 40 m, and others at disparities below the noise of .7 px."""
+    rng, poses = np.random.default_rng(0), path(frames, 0.1, np.array([0.0, 0.0, speed]), np.zeros(3))
+    points = np.concatenate([cloud(poses, 900, rng, 5, 40), cloud(poses, 600, rng, 1000, 2000)])
+    points = points[rng.permutation(1500)]
+    return Scene(RIG, 0.1 * np.arange(frames), poses, points, tuple(observe(T, points, 0.7, rng, 60) for T in poses))
+
+
 def begun_in_the_dark(seed: int) -> tuple[EstimatorModels, Array, list[Observations]]:
     """A map that begins where nobody knows how the camera is turned: two points, six seconds in the dark, then many.
 

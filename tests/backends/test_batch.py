@@ -18,7 +18,7 @@ from slam.models import EstimatorModels, MotionModel, models_for
 from slam.run.replay import replay
 from slam.system import StereoSlam
 from slam.worlds import open_world
-from tests.backends.scenes import RIG, path, run, scene
+from tests.backends.scenes import RIG, path, run, scene, with_far_points
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
 
@@ -53,6 +53,28 @@ def test_a_problem_that_cannot_be_solved_is_one_line(monkeypatch):
     with pytest.raises(SolverError, match="Indeterminant") as caught:
         backend.trajectory()
     assert "\n" not in str(caught.value)
+
+
+def test_far_landmarks_leave_it_its_own_covariances(caplog):
+    """One that went to infinity took those of everything away."""
+    data = with_far_points(30, 3.0)
+    backend = BatchBackend(RIG, EstimatorModels(MotionModel(1.0, 0.3), 0.7, initial_velocity_sigma=15.0))
+    run(backend, data)
+    found = backend.estimate()
+    off = se3.log(se3.inverse(found.T_world_left) @ data.poses[-1])
+    assert off @ np.linalg.solve(found.covariance, off) < 25
+    assert "the estimate is the smoother's" not in caplog.text
+    near = np.linalg.norm(data.points[found.ids] - data.poses[-1][:3, 3], axis=1) < 60
+    off = (found.positions - data.points[found.ids])[near]
+    assert np.median(np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariances[near]), off)) < 6
+
+
+def test_the_attitude_at_the_start_is_not_measured():
+    """Nothing is measured but relative to it: the motion's prior took three quarters of its variance away."""
+    data = scene(path(40, 0.1, np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.03, 0.0])), points=150)
+    backend = BatchBackend(RIG, replace(MODELS, initial_rotation_sigma=0.2))
+    run(backend, data)
+    assert np.linalg.eigvalsh(backend.estimate().covariance[:3, :3]).min() > 0.99 * 0.2**2
 
 
 @pytest.mark.parametrize(
