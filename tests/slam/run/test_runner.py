@@ -14,6 +14,8 @@ import pytest
 
 from slam.atlas.config import AtlasConfig
 from slam.atlas.map_io import load_map
+from slam.calibration.estimator import SelfCalibration
+from slam.commands.ending import Stopped, catch_signals, ended_by_signals
 from slam.config import SystemConfig
 from slam.errors import SequenceError, SlamError
 from slam.geometry.trajectory import Trajectory
@@ -23,8 +25,9 @@ from slam.run.outputs import FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS
 from slam.run.recording import load_recording
 from slam.run.run_data import RunData
 from slam.run.runner import run
+from slam.run.summary import RunRecord
 from slam.sequences import open_sequence
-from tests.failing_runs import Features, Scripted, require_whole
+from tests.failing_runs import FRAMES, Features, Scripted, require_whole
 
 WORLD = "synthetic:aisle?frames=12"
 WITH_TRUTH = set(schema.FILES) - {"summary.png"}  # that one is the command's
@@ -48,6 +51,13 @@ def test_landmarks_that_have_left_the_map_are_kept_where_they_were(tmp_path, mon
     assert len(data.old) > 10
     away = np.linalg.norm(data.old - data.online.positions.mean(axis=0), axis=1)
     assert 0.5 < np.median(away) < 6.0  # on the shelves
+
+
+def test_what_the_calibration_is_warned_of_is_said_and_kept(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(SelfCalibration, "warning", "the images fit another focal length")
+    summary = run(open_sequence("synthetic:aisle?frames=2"), options(tmp_path))
+    assert caplog.messages == summary["warnings"] == ["the images fit another focal length"]
+    assert summary["doubt"] == "" == summary["tracking"]
 
 
 def test_a_run_leaves_its_files(tmp_path):
@@ -87,6 +97,51 @@ def test_a_fault_half_way_keeps_what_was_done(tmp_path):
     assert "disk gone" in json.loads((tmp_path / "out" / "summary.json").read_text())["ended"]
     assert len(load_map(tmp_path / "map"))
     assert len(load_recording(tmp_path / "tape.npz")) == 3
+
+
+@pytest.fixture
+def signals():
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = [signal.signal(number, signal.SIG_DFL) for number in numbers]
+    yield
+    for number, handler in zip(numbers, before):
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("frames", [2, FRAMES])
+def test_a_summary_says_which_signal_ended_the_run_before_its_last_frame(tmp_path, signals, number, frames):
+    catch_signals()
+    record, done = RunRecord(), []
+
+    def on_frame(result):
+        done.append(result)
+        if len(done) == frames:
+            signal.raise_signal(number)
+
+    with pytest.raises(Stopped) as stopped, ended_by_signals(tmp_path, record) as until:
+        run(Scripted(None, 0), options(tmp_path), on_frame, Features(), until=until, record=record)
+    said = "ended by the user" if number == signal.SIGINT else f"stopped: {signal.Signals(number).name}"
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (len(done), summary["frames"]) == (frames, frames)
+    assert summary["ended"] == (said if frames < FRAMES else "completed")
+    assert stopped.value.number == number and stopped.value.leaves.startswith("frames done so far are kept")
+
+
+def test_a_run_that_is_stopped_at_once_in_its_first_frame_says_that_there_is_none(tmp_path):
+    record, second = RunRecord(), Stopped(signal.SIGINT)
+    with pytest.raises(Stopped) as stopped, ended_by_signals(tmp_path, record) as until:
+        run(Scripted(second, 0), options(tmp_path), None, Features(), until=until, record=record)
+    assert stopped.value.leaves == "no frame was done yet" and not list(tmp_path.iterdir())
+
+
+def test_a_second_signal_stops_at_once(tmp_path, signals):
+    catch_signals()
+    with pytest.raises(Stopped, match="SIGTERM"), ended_by_signals(tmp_path, RunRecord()) as until:
+        signal.raise_signal(signal.SIGINT)
+        assert until.is_set()
+        signal.raise_signal(signal.SIGTERM)
+        pytest.fail("it is waited for")
 
 
 @pytest.mark.slow

@@ -94,10 +94,12 @@ MAP = MapConfig(target_in_view=40, max_depth_error=0.3, restart_after=12)
 CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5), map=MAP)
 
 
-def run(backend, poses):
+def run(backend, poses, dark=range(0)):
     cloud, system, results, points = Cloud(150), StereoSlam(RIG, None, backend, config=CONFIG), [], []
     for k, T in enumerate(poses):
         features, ids = cloud.features(T, k / 30, 0.3)
+        if k in dark:
+            features, ids = StereoFeatures.empty(features.stamp, 32), ids[:0]
         results.append(system.process_features(features))
         points.append(ids)
     return system, results, points
@@ -115,6 +117,19 @@ def right_share(results, points):
         total += len(result.matched)
         owner.update({i: ids[row] for i, row in zip(result.added.tolist(), result.added_features)})
     return right / total
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_two_seconds_of_blackout(backend):
+    poses = path(95)
+    system, results, points = run(backend, poses, range(20, 80))
+    lost = CONFIG.map.lost_after - 1
+    dark = [("predicted", lost), ("lost", 60 - lost)]
+    assert states(results) == [("started", 1), ("tracked", 19), *dark, ("tracked", 15)]
+    assert not any(len(r.added) for r in results[20:80])
+    assert right_share(results, points) == 1
+    assert np.linalg.norm(system.trajectory().positions[-1] - poses[-1][:3, 3]) < 0.012
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
