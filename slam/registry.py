@@ -67,7 +67,8 @@ def resolve(role: str, name: str) -> Any:
     target = name if own else _table(role).get(name)
     if target is None:
         if name == "simulated":
-            raise UnknownNameError(f"{what} {name!r} is for worlds in `slam compare` alone; leave it out")
+            known = ", ".join(names(role))
+            raise UnknownNameError(f"{what} {name!r} is for worlds in `slam compare` alone; known: {known}")
         own_module = name if Path(f"{name}.py").is_file() else "module"
         raise UnknownNameError(f"{unknown(what, name, names(role))}; or one of your own: {own_module}:Class")
     failed = f"{what} {name!r} cannot be loaded:"

@@ -6,7 +6,6 @@ import os
 import shlex
 import signal
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,12 +13,11 @@ from typing import IO
 
 from slam.errors import PartError, SlamError, one_line
 from slam.files import reason
+from slam.run.runner import Until
+from slam.run.summary import RunRecord
 
 #: Signals that end a run with all its files: Ctrl-C, a request to end, a closed terminal.
-_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
-
-_until: threading.Event | None = None  # that a run looks at after each frame
-_received = 0  # the signal that set it
+_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 class Stopped(BaseException):
@@ -34,38 +32,56 @@ class Stopped(BaseException):
 
 def catch_signals() -> None:
     """Have the signals raise `Stopped`, but for those that this process is told to ignore, as `nohup` has it."""
-    for name in _SIGNALS:
-        number = getattr(signal, name, None)
-        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+    for number in _SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _stop)
 
 
 def _stop(number: int, frame: object) -> None:
-    """Stop at once; a run after its present frame, so that all files agree. Twice: at once."""
-    global _received
-    if _until is None or _until.is_set():
-        raise Stopped(number)
-    _received = number
-    _until.set()
+    raise Stopped(number)
+
+
+class _Request(Until):
+    """Set by a signal, so that a run ends after its present frame and all files agree; a second one stops it at once.
+
+    Attributes:
+        number: the signal that set it.
+    """
+
+    number = 0
+
+    def receive(self, number: int, frame: object) -> None:
+        """A handler of signals."""
+        if self.is_set():
+            raise Stopped(number)
+        self.number = number
+        if number != signal.SIGINT:
+            self.ended = f"stopped: {signal.Signals(number).name}"
+        self.set()
 
 
 @contextmanager
-def ended_by_signals(folder: Path, live: bool = False) -> Iterator[threading.Event]:
+def ended_by_signals(folder: Path, record: RunRecord, live: bool = False) -> Iterator[Until]:
     """What a signal sets, so that a run has no more frames; it raises `Stopped` when the run has left its files.
 
-    Ctrl-C is how a `live` run ends, and has no further effect there. A signal's message names the run's `folder`.
+    Ctrl-C is how a `live` run ends, and has no further effect there. A signal's message names the run's `folder`, where
+    its `record` has a frame.
     """
-    global _until
-    _until = until = threading.Event()
+    until = _Request()
+    caught = [number for number in _SIGNALS if signal.getsignal(number) is _stop]
+    for number in caught:
+        signal.signal(number, until.receive)
     try:
         yield until
-        if until.is_set() and not (live and _received == signal.SIGINT):
-            raise Stopped(_received)
+        if until.is_set() and not (live and until.number == signal.SIGINT):
+            raise Stopped(until.number)
     except Stopped as stopped:
-        stopped.leaves = f"frames done so far are kept: `slam plot {shlex.quote(str(folder))}` draws them"
+        kept = f"frames done so far are kept: `slam plot {shlex.quote(str(folder))}` draws them"
+        stopped.leaves = kept if record.numbers else "no frame was done yet"
         raise
     finally:
-        _until = None
+        for number in caught:
+            signal.signal(number, _stop)
 
 
 @contextmanager

@@ -69,7 +69,7 @@ def run_sequence(
         if live and not quiet:
             what = "are taken until" if is_live(opened) else "come at their own rate, to the last one or until"
             print(f"slam: loading; then frames {what} Ctrl-C ends the run", file=sys.stderr)
-        until = stack.enter_context(ended_by_signals(folder, live))
+        until = stack.enter_context(ended_by_signals(folder, gathered, live))
         summary = run(opened, options, tell, watches=watches, until=until, record=gathered)
     finish(summary, written, picture, quiet)
 
@@ -83,11 +83,12 @@ def run_recorded(
     default = SystemConfig.for_kind(loaded.kind, None)
     require_settable(settings, default.to_json(), "")
     config = replace(default, models=loaded.models).with_settings(settings)
+    gathered = RunRecord()
     with run_folder(out, loaded.name, name) as folder:
         options = RunOptions(name, "recording", config, folder, kind=loaded.kind, command=command_line())
         require_outputs(options.outputs, [recording], overwrite)
-        with progress(len(loaded), _title(loaded, name), quiet) as tell, ended_by_signals(folder) as until:
-            summary = run_recording(loaded, options, tell, until=until)
+        with progress(len(loaded), _title(loaded, name), quiet) as tell, ended_by_signals(folder, gathered) as until:
+            summary = run_recording(loaded, options, tell, gathered, until)
     finish(summary, options.outputs, picture, quiet)
 
 

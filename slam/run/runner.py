@@ -42,6 +42,16 @@ logger = logging.getLogger("slam.run")
 Watch = Callable[[StereoFrame, FrameResult, StereoSlam], None]
 
 
+class Until(threading.Event):
+    """Ends a run when it is set, after the present frame, as if there were no more.
+
+    Attributes:
+        ended: how the run then ended, for its summary.
+    """
+
+    ended = "ended by the user"
+
+
 @one_blas_thread
 def run(
     sequence: Sequence,
@@ -49,7 +59,7 @@ def run(
     on_frame: Callable[[FrameResult], None] | None = None,
     frontend: Frontend | None = None,
     watches: Iterable[Watch] = (),
-    until: threading.Event | None = None,
+    until: Until | None = None,
     record: RunRecord | None = None,
 ) -> dict[str, Any]:
     """Run a sequence; returns the summary that is also written to ``summary.json``.
@@ -65,7 +75,7 @@ def run(
         on_frame: called after every frame, for a progress display.
         frontend: used in place of the one that the options name.
         watches: called after every step with its images, its result and the system, to show or to draw it.
-        until: ends the run when it is set, after the present frame, as if there were no more.
+        until: ends the run when it is set.
         record: gathers what the run gives, for whom the files are not enough.
 
     Raises:
@@ -95,7 +105,7 @@ def run(
     )
     if live is not None:  # before its clock starts, with its first frame
         warm_up(options.backend if options.backend in registry.ONLINE else registry.ONLINE[0], until=until)
-    way = _Run(sequence, options, system, record or RunRecord(), until or threading.Event(), live)
+    way = _Run(sequence, options, system, record or RunRecord(), until or Until(), live)
     return way.drive(way.processed(frames, tuple(watches)), on_frame)
 
 
@@ -105,7 +115,7 @@ def run_recording(
     options: RunOptions,
     on_frame: Callable[[FrameResult], None] | None = None,
     record: RunRecord | None = None,
-    until: threading.Event | None = None,
+    until: Until | None = None,
 ) -> dict[str, Any]:
     """Replay a recording through a back end; leaves the files of a run and returns its summary.
 
@@ -115,7 +125,7 @@ def run_recording(
     models = inside.models(config.models)
     backend = registry.create("backends", options.backend, inside.rig, models=models, **config.backend)
     results = zip((f.number for f in recording), replay(recording, backend, association=config.association))
-    way = _Run(recording, options, Replayed(recording, backend), record or RunRecord(), until or threading.Event())
+    way = _Run(recording, options, Replayed(recording, backend), record or RunRecord(), until or Until())
     return way.drive(results, on_frame)
 
 
@@ -127,7 +137,7 @@ class _Run:
     options: RunOptions
     system: StereoSlam | Replayed
     record: RunRecord
-    until: threading.Event
+    until: Until
     live: LiveFrames | None = None
     tape: list[RecordedFrame] = field(default_factory=list)
     failures: list[Exception] = field(default_factory=list)  # of the last files
@@ -194,8 +204,8 @@ class _Run:
                 ended, stopped_by = f"stopped: {_said(error)}", error
                 raise
             finally:
-                if self.until.is_set() and stopped_by is None:
-                    ended = "ended by the user"
+                if self.until.is_set() and stopped_by is None and not self._whole():
+                    ended = self.until.ended
                 summary = names | {"ended": ended} | self._tracking()
                 self._write_last(files, summary, score)
                 lines = list(dict.fromkeys(map(_said, self.failures)))
@@ -206,6 +216,15 @@ class _Run:
                     defects = (error for error in self.failures if not isinstance(error, SlamError))
                     raise next(defects, SlamError("; ".join(lines)))
         return summary
+
+    def _whole(self) -> bool:
+        """Whether the last frame was done; a camera has none."""
+        sequence, options, numbers = self.sequence, self.options, self.record.numbers
+        if is_live(sequence) or not numbers:
+            return False
+        if isinstance(sequence, Recording):
+            return numbers[-1] == sequence.frames[-1].number
+        return numbers[-1] == range(len(sequence))[options.start : options.stop][-1]
 
     def _place(self, step: int | None) -> int | str:
         """The frame whose place was seen again, ``map`` for one of the map that the run started in; empty for none."""
