@@ -38,18 +38,8 @@ BACKENDS = ("ekf", "smoother")  # whose parts are switched off
 _LONG = 100  # frames from which a sequence comes last
 #: What was decided by these tables, without figures: they are above it.
 FOLLOWED = """
-The ratios of `smoother` are alike. What follows:
-
-- Self-calibration earns its time on drives, several times over. Where the rig is right it does no harm.
-- Patch alignment is on for handheld cameras, which gain everywhere. Recorded drives are no better with it; the rendered
-  `street` is (`association.align=true`).
-- The detector of moving objects takes a fifth of a step, and the path needs it little here: it stays for the bodies
-  that it finds. `objects.mode=off` is for scenes where nothing moves.
-- One iteration fails where frames are far apart (V1_01, `street`): the filter iterates.
-- Without the rig's uncertainty paths are the same, and covariances far too small on raw 0001 and V1_01.
-- The atlas costs nothing where no place is seen again.
-- Left pixels alone, as in the papers, are worse in most cases.
-- Pixel noise as on drives makes handheld paths much worse; that of the hand does drives no harm.
+The ratios of `smoother` are alike. Patch alignment is on for handheld cameras; recorded drives are no better with it. The
+detector stays for the bodies that it finds.
 """
 COLUMNS = ("without", "error", "largest", "larger in", "NEES", "CPU")
 HEADER = ("sequence", "trial", "back end", "variant", "error", "NEES", "frames", "lost", "ms")
