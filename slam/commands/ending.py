@@ -9,12 +9,14 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 from slam.errors import PartError, SlamError, one_line
 from slam.files import reason
-from slam.run.runner import Until
-from slam.run.summary import RunRecord
+from slam.run.until import Until
+
+if TYPE_CHECKING:
+    from slam.run.summary import RunRecord
 
 #: Signals that end a run with all its files: Ctrl-C, a request to end, a closed terminal.
 _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]

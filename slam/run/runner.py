@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -30,6 +29,7 @@ from slam.run.recording import RecordedFrame, Recording, save_recording
 from slam.run.replay import replay
 from slam.run.schema import schema
 from slam.run.summary import Replayed, RunRecord, live_frames, results_of
+from slam.run.until import Until
 from slam.run.warm_up import warm_up
 from slam.runtime.threads import one_blas_thread
 from slam.sequences import Sequence, is_live
@@ -40,16 +40,6 @@ logger = logging.getLogger("slam.run")
 
 #: Is shown each step: its images, what came of it, and the system after it.
 Watch = Callable[[StereoFrame, FrameResult, StereoSlam], None]
-
-
-class Until(threading.Event):
-    """Ends a run when it is set, after the present frame, as if there were no more.
-
-    Attributes:
-        ended: how the run then ended, for its summary.
-    """
-
-    ended = "ended by the user"
 
 
 @one_blas_thread
