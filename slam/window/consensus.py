@@ -42,10 +42,9 @@ def find_consensus(
 
     The guess of T_world_left (4, 4) is tried first, refined on what agrees with it, then on what disagrees with it
     least, and is enough where a clear majority agrees; where none does, the second may be a pose between those of the
-    world and of something that moves. The other `hypotheses` are poses from the left pixels of three
-    matches (P3P). Landmarks are at `points` (M, 3) in the world [m], `measured` (M, 3) = (uL, vL, uR) [px], uR NaN for
-    monocular rows; an inlier is off by `threshold` at most in each. Raises CalibrationError where the rig is not
-    rectified.
+    world and of something that moves. The other `hypotheses` are poses from the left pixels of three matches (P3P).
+    Landmarks are at `points` (M, 3) in the world [m], `measured` (M, 3) = (uL, vL, uR) [px], uR NaN for monocular rows;
+    an inlier is off by `threshold` at most in each. Raises CalibrationError where the rig is not rectified.
     """
     stereo = RectifiedStereo.of(rig)
     matches = _Matches(
