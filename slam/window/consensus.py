@@ -41,10 +41,10 @@ def find_consensus(
     """The pose with which most matches agree (RANSAC on minimal sets of three, then least squares on all that agree).
 
     The guess of T_world_left (4, 4) is tried first, refined on what agrees with it, then on what disagrees with it
-    least, and is enough where a clear majority agrees. The other `hypotheses` are poses from the left pixels of three
-    matches (P3P). Landmarks are at `points` (M, 3) in the world [m], `measured` (M, 3) = (uL, vL, uR) [px], uR NaN for
-    monocular rows; an inlier is off by `threshold` at most in each. Raises CalibrationError where the rig is not
-    rectified.
+    least, and is enough where a clear majority agrees; where none does, the second may be a pose between those of the
+    world and of something that moves. The other `hypotheses` are poses from the left pixels of three matches (P3P).
+    Landmarks are at `points` (M, 3) in the world [m], `measured` (M, 3) = (uL, vL, uR) [px], uR NaN for monocular rows;
+    an inlier is off by `threshold` at most in each. Raises CalibrationError where the rig is not rectified.
     """
     stereo = RectifiedStereo.of(rig)
     matches = _Matches(
@@ -58,8 +58,10 @@ def find_consensus(
     if nearer.inliers.sum() >= max(clear, float(first.inliers.sum())):
         return nearer
     hypothesis = matches.best_hypothesis(hypotheses, seed)
-    found = [first, nearer] if hypothesis is None else [first, nearer, matches.polished(hypothesis)]
-    return max(found, key=lambda one: one.inliers.sum())
+    if hypothesis is None:
+        return first
+    best = matches.polished(hypothesis)
+    return best if best.inliers.sum() > first.inliers.sum() else first
 
 
 def landmarks_pose(measure: RectifiedMeasurement, points: Array, z: Array, T: Array, seed: int) -> Array | None:

@@ -8,7 +8,7 @@ from slam.chi_square import chi_square_limit
 from slam.errors import CalibrationError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig, measurement_rows
-from slam.window.consensus import PoseConsensus, find_consensus
+from slam.window.consensus import find_consensus
 from slam.window.gating import _passing, squared_distances
 from slam.window.pose_only import PoseProblem, solve
 from slam.window.stereo import RectifiedStereo
@@ -73,15 +73,6 @@ def test_too_few_matches_do_no_harm(count):
     found = find_consensus(RIG, points, z, np.eye(4), 2.0, 50, seed=0)
     assert np.isfinite(found.T_world_left).all()
     assert found.inliers.shape == (count,)
-
-
-def test_no_tried_pose_has_more_that_agree_than_the_one_returned(monkeypatch):
-    """Of the guess, what is nearer to the matches, and a hypothesis, the second may be the best without a majority."""
-    counts = iter([3, 6, 4])
-    found = lambda *_: PoseConsensus(np.eye(4), np.arange(12) < next(counts))  # noqa: E731
-    monkeypatch.setattr("slam.window.consensus._Matches.polished", found)
-    points, z = measured_from(T_TRUE, count=12)
-    assert find_consensus(RIG, points, z, np.eye(4), 2.0, 50, seed=3).inliers.sum() == 6
 
 
 @pytest.mark.parametrize(
