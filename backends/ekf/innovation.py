@@ -167,45 +167,35 @@ class Linearisation:
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
         return np.asarray(upper_inverse(upper).T)
 
-    @cached_property
-    def information(self) -> Array:
-        """Blocks (M, 3, 3) on the diagonal of ``S⁻¹``."""
-        columns = self.L_inverse.reshape(len(self.L_inverse), len(self.z), 3).transpose(1, 2, 0)
-        return np.asarray(columns @ columns.transpose(0, 2, 1))
-
     def solved(self, used: BoolArray) -> Solution:
         """The update by some landmarks (mask (M,)). Raises LinAlgError if S is not positive definite."""
         out = np.flatnonzero(np.repeat(~used, 3))
-        Q = self.L_inverse.T @ self.L_inverse[:, out]
-        root_inverse = np.linalg.inv(np.linalg.cholesky(Q[out]))
-        return Solution(self, used, out, root_inverse, Q @ root_inverse.T)
+        G, root = np.linalg.qr(self.L_inverse[:, out])
+        whitening = self.L_inverse - G @ (G.T @ self.L_inverse)
+        whitening[:, out] = 0.0  # of rounding
+        return Solution(self, used, out, G, root, whitening)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
     """The update by some of the landmarks, linearised somewhere.
 
-    One factor of S serves any choice of them. With ``Q = S⁻¹`` and b the rows that are left out, the inverse of the
-    others' block of S is ``Q − E Eᵀ``, with ``E = Q_:b C⁻ᵀ`` and ``Q_bb = C Cᵀ``; in the rows b that is zero.
+    One factor of ``S = L Lᵀ`` serves any choice of them. The rows b of ν that are left out move ``L⁻¹ ν`` along the
+    columns ``L⁻¹_:b = G R`` alone, with orthonormal G. ``W = (1 − G Gᵀ) L⁻¹`` takes that part away, and ``Wᵀ W`` is the
+    inverse of the others' block of S. As a difference of two inverses it would lose its digits where the prior is wide.
     """
 
     at: Linearisation
     used: BoolArray  # which landmarks (M,)
     out: IndexArray  # rows b (B,) of the innovation, of the others
-    root_inverse: Array  # C⁻¹ (B, B)
-    E: Array  # (3M, B)
+    G: Array  # (3M, B)
+    R: Array  # (B, B)
+    W: Array  # (3M, 3M), zero in the columns b: a wrong match may be off by anything
     linear: bool = True  # whether the measurements are so at the solution; not looked at where one linearisation is all
 
     def weighted(self, X: Array) -> Array:
         """``S⁻¹ X`` of some columns (3M, ...) by what is used alone; zero in the rows of what is not."""
-        L_inverse, X = self.at.L_inverse, self.of_used(X)
-        return self.of_used(L_inverse.T @ (L_inverse @ X) - self.E @ (self.E.T @ X))
-
-    def of_used(self, X: Array) -> Array:
-        """Columns (3M, ...) with zeros in the rows of what is not used: a wrong match may be off by anything."""
-        X = X.copy()
-        X[self.out] = 0.0
-        return X
+        return np.asarray(self.W.T @ (self.W @ X))
 
     @cached_property
     def y(self) -> Array:
@@ -230,33 +220,36 @@ class Solution:
     @cached_property
     def pose_covariance(self) -> Array:
         """Of the error [r, φ] (6, 6) after the update, in the prior's coordinates."""
-        HP = self.at.HP[:, :POSE]
-        return np.asarray(self.at.update.covariance.pose - HP.T @ self.weighted(HP))
+        white = self.W @ self.at.HP[:, :POSE]
+        return np.asarray(self.at.update.covariance.pose - white.T @ white)
 
-    def gain(self) -> tuple[Array, Array, Array]:
-        """V (n, 3M) and U (n, B) with ``V Vᵀ − U Uᵀ = K S Kᵀ``; and what errors of the rig change in the gain's errors.
+    def gain(self) -> tuple[Array, Array]:
+        """V (n, 3M) with ``V Vᵀ = K S Kᵀ``; and what errors of the rig change in the gain's errors.
 
         The last (n, m) is ``K (H x − F)`` with the derivatives x of the errors by those of the rig, and its field F.
         """
         at, update = self.at, self.at.update
         V = dtrmm(1.0, at.L_inverse.T, at.HP.T, side=1)
+        V -= (V @ self.G) @ self.G.T
         by_rig = at.H_times(update.covariance.by_rig[update.numbers])
         by_rig -= np.where(at.seen[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
-        return V, at.HP.T @ self.E, at.HP.T @ self.weighted(by_rig)
+        return V, at.HP.T @ self.weighted(by_rig)
 
     @cached_property
     def distances(self) -> Array:
         """Squared distance (M,) of each landmark's measurement from what all others that are used predict.
 
-        With ``y_j`` and ``Q_j`` in the rows j of a landmark that is used, its innovation is off by ``Q_j⁻¹ y_j``, with
-        covariance ``Q_j⁻¹``: the distance is ``y_jᵀ Q_j⁻¹ y_j``. Those that are not used are off by ``ν_b + C⁻ᵀ Eᵀ ν``,
-        with ν of the others, and covariance ``Q_bb⁻¹ = C⁻ᵀ C⁻¹``. A landmark that is not seen has distance 0.
+        With ``y_j`` and ``Q_j = W_jᵀ W_j`` in the rows j of a landmark that is used, its innovation is off by
+        ``Q_j⁻¹ y_j``, with covariance ``Q_j⁻¹``: the distance is ``y_jᵀ Q_j⁻¹ y_j``. Those that are not used are off by
+        ``ν_b + R⁻¹ Gᵀ L⁻¹ ν``, with ν of the others, and covariance ``R⁻¹ R⁻ᵀ``. A landmark that is not seen has
+        distance 0.
         """
-        E, root = self.E.reshape(len(self.used), 3, len(self.out)), self.root_inverse
-        off, blocks = self.y.reshape(-1, 3).copy(), self.at.information - E @ E.transpose(0, 2, 1)
-        nu = self.at.nu
-        off[~self.used] = (nu[self.out] + self.of_used(nu) @ self.E @ root).reshape(-1, 3)
-        blocks[~self.used] = diagonal_blocks(root.T @ root)
+        at, used, R_inverse = self.at, self.used, np.linalg.inv(self.R)
+        nu, columns = at.nu.copy(), self.W.reshape(len(self.W), len(used), 3).transpose(1, 2, 0)
+        nu[self.out] = 0.0
+        off, blocks = self.y.reshape(-1, 3).copy(), columns @ columns.transpose(0, 2, 1)
+        off[~used] = (at.nu[self.out] + R_inverse @ (self.G.T @ (at.L_inverse @ nu))).reshape(-1, 3)
+        blocks[~used] = diagonal_blocks(R_inverse @ R_inverse.T)
         found = squared_distances(off, blocks)
         if not np.isfinite(found).all():
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")

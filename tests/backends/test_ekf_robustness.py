@@ -83,6 +83,24 @@ def test_a_gap_of_any_length(make, gap):
 
 
 @BOTH
+@pytest.mark.parametrize(("kind", "gap"), [("handheld", 3.0), ("driving", 10.0)])
+def test_wrong_matches_after_a_gap_are_left_out(make, kind, gap):
+    """Of a prior as wide as after a gap nothing is lost in rounding where landmarks are left out."""
+    models, forward = models_for(kind), path(11, 0.1, np.array([0, 0, 0.2]), np.zeros(3))
+    for seed in range(3):
+        data, rng = scene(forward, 600, models.pixel_sigma, seed=seed, limit=40), np.random.default_rng(seed)
+        backend, known = make(RIG, models), set()
+        for stamp, _, seen in list(data)[:-1]:
+            step(backend, stamp, seen, known)
+        seen, wrong = data.observations[-1], rng.random((40, 1)) < 0.2
+        left, right = rng.uniform(-200, 200, (2, 40, 2)) * wrong
+        seen = Observations(seen.ids, seen.uv_left + left, seen.uv_right + right)
+        report = step(backend, data.stamps[-1] + gap, seen, known)
+        assert report.status is UpdateStatus.OK, report.reason
+        assert nees(backend, data.poses[-1]) < chi2.ppf(0.9999, 6)
+
+
+@BOTH
 @pytest.mark.parametrize("count", [5, 7, 20])
 def test_known_landmarks_are_found_again_after_a_blind_stretch(make, count):
     """The camera went where the motion model does not expect it, and sees but landmarks it knows: it starts there."""
