@@ -16,7 +16,7 @@ from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from backends.ekf.camera import Camera
-from backends.ekf.covariance import CAMERA, HEAD, POSE, Covariance
+from backends.ekf.covariance import CAMERA, HEAD, POSE, Covariance, reordered
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
@@ -159,48 +159,44 @@ class Linearisation:
         S[np.diag_indices(len(S))] += self.update.sigma**2
         return S
 
-    @cached_property
-    def L_inverse(self) -> Array:
-        """Of ``S = L Lᵀ`` (3M, 3M), lower triangular. Raises LinAlgError if S is not positive definite."""
-        upper, info = dpotrf(self.S.T)  # of the transpose, which is in the order that LAPACK wants
-        if info != 0:
-            raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
-        return np.asarray(upper_inverse(upper).T)
-
     def solved(self, used: BoolArray) -> Solution:
         """The update by some landmarks (mask (M,)). Raises LinAlgError if S is not positive definite."""
-        out = np.flatnonzero(np.repeat(~used, 3))
-        G, root = np.linalg.qr(self.L_inverse[:, out])
-        whitening = self.L_inverse - G @ (G.T @ self.L_inverse)
-        whitening[:, out] = 0.0  # of rounding
-        return Solution(self, used, out, G, root, whitening)
+        rows = np.argsort(np.repeat(~used, 3), kind="stable")
+        # of the transpose, which is in the order that LAPACK wants
+        upper, info = dpotrf(reordered(self.S, rows).T, overwrite_a=1)
+        if info != 0:
+            raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
+        k, inverse = 3 * np.count_nonzero(used), upper_inverse(upper).T
+        return Solution(self, used, rows[:k], rows[k:], inverse[:k, :k], inverse[k:, :k], upper[k:, k:].T)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The update by some of the landmarks, linearised somewhere.
+    """The update by some of the landmarks, linearised somewhere: K of them.
 
-    One factor of ``S = L Lᵀ`` serves any choice of them. The rows b of ν that are left out move ``L⁻¹ ν`` along the
-    columns ``L⁻¹_:b = G R`` alone, with orthonormal G. ``W = (1 − G Gᵀ) L⁻¹`` takes that part away, and ``Wᵀ W`` is the
-    inverse of the others' block of S. As a difference of two inverses it would lose its digits where the prior is wide.
+    With their rows a before those of the others, b, the corner L_aa of ``S = L Lᵀ`` is their own factor. The others may
+    be off by anything: nothing but their distances depends on them.
     """
 
     at: Linearisation
     used: BoolArray  # which landmarks (M,)
-    out: IndexArray  # rows b (B,) of the innovation, of the others
-    G: Array  # (3M, B)
-    R: Array  # (B, B)
-    W: Array  # (3M, 3M), zero in the columns b: a wrong match may be off by anything
+    rows: IndexArray  # a (3K,)
+    others: IndexArray  # b (B,)
+    L_inverse: Array  # (L⁻¹)_aa (3K, 3K), lower triangular
+    beneath: Array  # (L⁻¹)_ba (B, 3K)
+    rest: Array  # L_bb (B, B)
     linear: bool = True  # whether the measurements are so at the solution; not looked at where one linearisation is all
 
-    def weighted(self, X: Array) -> Array:
-        """``S⁻¹ X`` of some columns (3M, ...) by what is used alone; zero in the rows of what is not."""
-        return np.asarray(self.W.T @ (self.W @ X))
+    def white(self, X: Array) -> Array:
+        """``L_aa⁻¹ X_a`` (3K, ...) of some columns X (3M, ...)."""
+        return np.asarray(self.L_inverse @ X[self.rows])
 
     @cached_property
     def y(self) -> Array:
-        """``S⁻¹ ν`` (3M,)."""
-        return self.weighted(self.at.nu)
+        """``S⁻¹ ν`` (3M,) of what is used alone; zero for the others."""
+        y = np.zeros(len(self.at.nu))
+        y[self.rows] = self.white(self.at.nu) @ self.L_inverse
+        return y
 
     @property
     def nis(self) -> float:
@@ -220,36 +216,33 @@ class Solution:
     @cached_property
     def pose_covariance(self) -> Array:
         """Of the error [r, φ] (6, 6) after the update, in the prior's coordinates."""
-        white = self.W @ self.at.HP[:, :POSE]
+        white = self.white(self.at.HP[:, :POSE])
         return np.asarray(self.at.update.covariance.pose - white.T @ white)
 
     def gain(self) -> tuple[Array, Array]:
-        """V (n, 3M) with ``V Vᵀ = K S Kᵀ``; and what errors of the rig change in the gain's errors.
+        """V (n, 3K) with ``V Vᵀ = K S Kᵀ``; and what errors of the rig change in the gain's errors.
 
         The last (n, m) is ``K (H x − F)`` with the derivatives x of the errors by those of the rig, and its field F.
         """
         at, update = self.at, self.at.update
-        V = dtrmm(1.0, at.L_inverse.T, at.HP.T, side=1)
-        V -= (V @ self.G) @ self.G.T
+        V = dtrmm(1.0, self.L_inverse.T, at.HP[self.rows].T, side=1, overwrite_b=1)
         by_rig = at.H_times(update.covariance.by_rig[update.numbers])
         by_rig -= np.where(at.seen[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
-        return V, at.HP.T @ self.weighted(by_rig)
+        return V, V @ self.white(by_rig)
 
     @cached_property
     def distances(self) -> Array:
         """Squared distance (M,) of each landmark's measurement from what all others that are used predict.
 
-        With ``y_j`` and ``Q_j = W_jᵀ W_j`` in the rows j of a landmark that is used, its innovation is off by
+        With ``y_j`` and ``Q_j = (S⁻¹)_jj`` in the rows j of a landmark that is used, its innovation is off by
         ``Q_j⁻¹ y_j``, with covariance ``Q_j⁻¹``: the distance is ``y_jᵀ Q_j⁻¹ y_j``. Those that are not used are off by
-        ``ν_b + R⁻¹ Gᵀ L⁻¹ ν``, with ν of the others, and covariance ``R⁻¹ R⁻ᵀ``. A landmark that is not seen has
-        distance 0.
+        ``ν_b + L_bb (L⁻¹)_ba ν_a``, with covariance ``L_bb L_bbᵀ``. A landmark that is not seen has distance 0.
         """
-        at, used, R_inverse = self.at, self.used, np.linalg.inv(self.R)
-        nu, columns = at.nu.copy(), self.W.reshape(len(self.W), len(used), 3).transpose(1, 2, 0)
-        nu[self.out] = 0.0
-        off, blocks = self.y.reshape(-1, 3).copy(), columns @ columns.transpose(0, 2, 1)
-        off[~used] = (at.nu[self.out] + R_inverse @ (self.G.T @ (at.L_inverse @ nu))).reshape(-1, 3)
-        blocks[~used] = diagonal_blocks(R_inverse @ R_inverse.T)
+        used, nu, columns = self.used, self.at.nu, self.L_inverse.reshape(len(self.rows), -1, 3)
+        off, blocks = self.y.reshape(-1, 3).copy(), np.empty((len(used), 3, 3))
+        off[~used] = (nu[self.others] + self.rest @ (self.beneath @ nu[self.rows])).reshape(-1, 3)
+        blocks[used] = columns.transpose(1, 2, 0) @ columns.transpose(1, 0, 2)
+        blocks[~used] = diagonal_blocks(self.rest @ self.rest.T)
         found = squared_distances(off, blocks)
         if not np.isfinite(found).all():
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
