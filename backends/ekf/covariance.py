@@ -90,14 +90,10 @@ class Covariance:
 
     # --- the camera moves ---
 
-    def camera_moved(
-        self, J: Array, noise: Array, by_error: Array | None = None, rows: IndexArray | None = None,
-        slide: Array | None = None,
-    ) -> Covariance:  # fmt: skip
+    def camera_moved(self, J: Array, noise: Array, by_error: Array | None = None) -> Covariance:
         """The camera's error (12,) becomes J times what it was, plus noise (12, 12).
 
         With `by_error`, the pose before, that (6, 6) times [r, φ], is now the first of the last ones; the last goes.
-        Some landmarks (`rows` (M,) of the table) have more noise then, `slide` (M, 3, 3).
         """
         F = np.eye(HEAD) if by_error is None else np.eye(HEAD, k=-POSE)
         F[:CAMERA, :CAMERA] = J
@@ -109,13 +105,15 @@ class Covariance:
         own[:CAMERA, :CAMERA] += noise
         P[:HEAD, :HEAD] = 0.5 * (own + own.T)
         P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
-        known = self.known
-        if rows is not None and slide is not None:
-            there, known = rows < self.correlated, known.copy()
-            at = self.numbers(rows[there])
-            P[at[:, :, None], at[:, None, :]] += slide[there]
-            known[rows[~there] - self.correlated] += slide[~there]
-        return Covariance(P, by_rig, known)
+        return replace(self, P=P, by_rig=by_rig)
+
+    def advanced(self, J: Array, noise: Array, by_error: Array, rows: IndexArray, walk: Array) -> Covariance:
+        """As after `camera_moved`, and landmarks (`rows` (M,) of the table) have walked by covariances (M, 3, 3)."""
+        moved, there, known = self.camera_moved(J, noise, by_error), rows < self.correlated, self.known.copy()
+        at = self.numbers(rows[there])
+        moved.P[at[:, :, None], at[:, None, :]] += walk[there]  # nobody else has it yet
+        known[rows[~there] - self.correlated] += walk[~there]
+        return replace(moved, known=known)
 
     # --- landmarks join and leave ---
 
