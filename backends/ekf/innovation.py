@@ -238,7 +238,7 @@ class Solution:
         ``Q_j⁻¹ y_j``, with covariance ``Q_j⁻¹``: the distance is ``y_jᵀ Q_j⁻¹ y_j``. Those that are not used are off by
         ``ν_b + L_bb (L⁻¹)_ba ν_a``, with covariance ``L_bb L_bbᵀ``. A landmark that is not seen has distance 0.
         """
-        used, nu, columns = self.used, self.at.nu, self.L_inverse.reshape(len(self.rows), -1, 3)
+        used, nu, columns = self.used, self.at.nu, self.L_inverse.reshape(len(self.rows), len(self.rows) // 3, 3)
         off, blocks = self.y.reshape(-1, 3).copy(), np.empty((len(used), 3, 3))
         off[~used] = (nu[self.others] + self.rest @ (self.beneath @ nu[self.rows])).reshape(-1, 3)
         blocks[used] = columns.transpose(1, 2, 0) @ columns.transpose(1, 0, 2)
