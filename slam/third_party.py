@@ -20,7 +20,8 @@ from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, RecentBackend
 
-_LEAST = 1e-12 * np.eye(6)  # numerics: variances [rad²], [m²] of a pose that is known for certain
+_LEAST = 1e-12  # numerics: variance [rad²], [m²] of a pose that is known for certain
+_HARDLY = 1e-6 * np.eye(6)  # numerics: information of a pose that nothing has measured
 _OURS = ("slam", "backends", "frontends", "builtins")
 
 #: What each method answers: a type, and the types or shapes of its attributes. Equal letters stand for equal numbers,
@@ -104,7 +105,16 @@ class OnlinePose:
         if len(self.landmarks) < MINIMAL_POINTS:
             return np.zeros((6, 6))
         J = (self.rig.project_stereo(self.landmarks)[1] @ points_by_pose(self.landmarks)).reshape(-1, 6)
-        return np.linalg.inv(np.linalg.inv(self.estimate.covariance + _LEAST) + J.T @ J / self.sigma**2)
+        return at_most(np.linalg.inv(J.T @ J / self.sigma**2 + _HARDLY), self.estimate.covariance)
+
+
+def at_most(P: Array, most: Array) -> Array:
+    """What of a covariance P (6, 6) is no more than another one, in whatever direction."""
+    values, axes = np.linalg.eigh(most)
+    deviations = np.sqrt(values.clip(min=_LEAST))
+    shares, turn = np.linalg.eigh((axes / deviations).T @ P @ (axes / deviations))
+    axes = (axes * deviations) @ turn
+    return np.asarray((axes * shares.clip(0.0, 1.0)) @ axes.T)
 
 
 def recent_of(backend: Backend, path: Sequence[OnlinePose]) -> RecentPoses:
@@ -116,7 +126,7 @@ def recent_of(backend: Backend, path: Sequence[OnlinePose]) -> RecentPoses:
 
 
 def derived_recent(path: Sequence[OnlinePose]) -> RecentPoses:
-    """The last poses together, of a back end that does not tell how their errors hang together.
+    """The last poses together, approximately, of a back end that does not tell how their errors hang together.
 
     Each pose's error is one that goes on with the camera and grows with time, and the noise of its own frame. So two
     poses have in common what the earlier one is off by without its noise; where a pose became surer, as at an old
@@ -124,16 +134,12 @@ def derived_recent(path: Sequence[OnlinePose]) -> RecentPoses:
     """
     stamps = np.array([one.estimate.stamp for one in path])
     poses, P = np.stack([one.estimate.T_world_left for one in path]), np.zeros((6 * len(path), 6 * len(path)))
-    common = np.zeros((6, 6))
+    common: Array = np.zeros((6, 6))
     for i, one in reversed(list(enumerate(path))):
-        lasting = one.estimate.covariance - one.noise
+        lasting: Array = one.estimate.covariance - one.noise
         if i + 1 < len(path):
             back = adjoint(inverse(poses[i]) @ poses[i + 1])
-            values, axes = np.linalg.eigh(back @ common @ back.T)
-            deviations = np.sqrt(values.clip(min=_LEAST[0, 0]))
-            shares, turn = np.linalg.eigh((axes / deviations).T @ lasting @ (axes / deviations))
-            axes = (axes * deviations) @ turn
-            lasting = (axes * shares.clip(0.0, 1.0)) @ axes.T
+            lasting = at_most(lasting, back @ common @ back.T)
         common, own = lasting, slice(6 * i, 6 * i + 6)
         P[own, 6 * i :] = common @ adjoint(inverse(poses[i:]) @ poses[i]).reshape(-1, 6).T
         P[6 * i :, own] = P[own, 6 * i :].T

@@ -79,8 +79,9 @@ def predicted(camera: Camera, models: EstimatorModels, P: Array, dt: float, rest
     """A camera with the error's covariance P (12, 12), after `dt` [s]: ``A P Aᵀ + W Q Wᵀ`` (paper B, section 2).
 
     One that rests keeps its pose, and its velocity is zero for certain. One that may have turned anyhow meanwhile stays
-    where it is, as uncertain as the prior of the speed makes it; of its error only that of the position has to do with
-    the map still. Larger numbers would mean nothing, and leave a double too few digits for the map.
+    where it is, as uncertain as the prior of the speed makes it, by `ANYWHERE` at most: more, in one gap, would mean
+    nothing, and leave a double too few digits for the map. Of its error only that of the position has to do with the
+    map still, all of it: by less of one that a wide prior gives both, the map would tell where the world is.
     """
     if rests:
         return camera.stopped(), _AT_REST, np.zeros_like(P)

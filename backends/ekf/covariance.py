@@ -90,14 +90,10 @@ class Covariance:
 
     # --- the camera moves ---
 
-    def camera_moved(
-        self, J: Array, noise: Array, by_error: Array | None = None, rows: IndexArray | None = None,
-        slide: Array | None = None,
-    ) -> Covariance:  # fmt: skip
+    def camera_moved(self, J: Array, noise: Array, by_error: Array | None = None) -> Covariance:
         """The camera's error (12,) becomes J times what it was, plus noise (12, 12).
 
         With `by_error`, the pose before, that (6, 6) times [r, φ], is now the first of the last ones; the last goes.
-        Some landmarks (`rows` (M,) of the table) have more noise then, `slide` (M, 3, 3).
         """
         F = np.eye(HEAD) if by_error is None else np.eye(HEAD, k=-POSE)
         F[:CAMERA, :CAMERA] = J
@@ -109,13 +105,15 @@ class Covariance:
         own[:CAMERA, :CAMERA] += noise
         P[:HEAD, :HEAD] = 0.5 * (own + own.T)
         P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
-        known = self.known
-        if rows is not None and slide is not None:
-            there, known = rows < self.correlated, known.copy()
-            at = self.numbers(rows[there])
-            P[at[:, :, None], at[:, None, :]] += slide[there]
-            known[rows[~there] - self.correlated] += slide[~there]
-        return Covariance(P, by_rig, known)
+        return replace(self, P=P, by_rig=by_rig)
+
+    def advanced(self, J: Array, noise: Array, by_error: Array, rows: IndexArray, walk: Array) -> Covariance:
+        """As after `camera_moved`, and landmarks (`rows` (M,) of the table) have walked by covariances (M, 3, 3)."""
+        moved, there, known = self.camera_moved(J, noise, by_error), rows < self.correlated, self.known.copy()
+        at = self.numbers(rows[there])
+        moved.P[at[:, :, None], at[:, None, :]] += walk[there]  # nobody else has it yet
+        known[rows[~there] - self.correlated] += walk[~there]
+        return replace(moved, known=known)
 
     # --- landmarks join and leave ---
 
@@ -145,21 +143,19 @@ class Covariance:
 
     # --- an update ---
 
-    def corrected(self, V: Array, U: Array, by_rig: Array, J: Array, shift: Array) -> Covariance:
+    def corrected(self, V: Array, by_rig: Array, J: Array, shift: Array) -> Covariance:
         """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ`` (paper A, Eq. 11).
 
         The last poses keep the covariance that they have among themselves.
 
         Args:
-            V: ``K S Kᵀ = V Vᵀ − U Uᵀ`` (n, ·).
-            U: see V (n, ·).
+            V: ``K S Kᵀ = V Vᵀ`` (n, ·).
             by_rig: what errors of the rig change in the update (n, m), as derivatives.
             J: the corrected camera's error is J (12, 12) times that of the camera before.
             shift: the error of a corrected landmark is what it was plus its shift (N, 3, 6) times that of the pose.
         """
         last, by_rig, D = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), CAMERA))
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
-        P = dsyrk(1.0, U, 1.0, P.T, overwrite_c=1).T if U.size else P
         mirror(P[:CAMERA, :CAMERA])
         D[:CAMERA], D[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
         # with T = 1 + [D, 0]: T P Tᵀ = P + D Yᵀ + Y Dᵀ,  Y = P[:, :12] + D P_cc / 2
@@ -180,7 +176,7 @@ class Covariance:
         by_rig = self.by_rig.copy()
         by_rig[self.numbers(rows).ravel(), -1:] -= change.reshape(-1, 1)
         nothing = np.zeros((len(self.P), 0))
-        return replace(self, by_rig=by_rig).corrected(nothing, nothing, 0 * by_rig, np.eye(CAMERA), shift)
+        return replace(self, by_rig=by_rig).corrected(nothing, 0 * by_rig, np.eye(CAMERA), shift)
 
 
 @kernel

@@ -11,7 +11,7 @@ from numpy.linalg import LinAlgError
 from backends.ekf.camera import Camera, Motion, predicted
 from backends.ekf.covariance import CAMERA, POSE, RECENT, Covariance, positive
 from backends.ekf.innovation import Update
-from backends.ekf.landmarks import Coordinates, FilterLandmarks
+from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
 from backends.ekf.solve import agreement
 from backends.ekf.state import FilterState
 from slam.checks import known_landmarks, require_guess, require_not_measured, require_recent, require_stamp
@@ -28,7 +28,6 @@ from slam.window.stereo import TOO_LATE, Field, RectifiedMeasurement
 
 #: Standard deviations of a known point between it and its anchor: its coordinates are linear there, it stays Gaussian.
 _STAND_OFF = 100.0
-_UNCOUNTED = 0.1  # cost: variance of a slide that is not counted yet, as a share of the noise of a pixel
 _DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large
 
 
@@ -61,11 +60,7 @@ class LandmarkFilter:
         self.rig, self.models = rig, models
         self._coordinates, self._iterations, self._stereo = coordinates, iterations, stereo
         self._measure = RectifiedMeasurement(rig, models.with_slide())
-        self._slide: tuple[float, ...] = (0.0,)  # see `FilterState.advanced`
-        if density := models.slide.density:
-            noise = self._measure.models.pixel_sigma**2
-            angles = np.array([models.pixel_sigma**2 - noise, _UNCOUNTED * noise]) / density**2
-            self._slide = density / self._measure.stereo.f, *angles.tolist()
+        self._slide = Slide.of(models, self._measure.stereo.f)
         self.state = FilterState.first(camera, P)
         self._past: list[tuple[float, Array]] = []  # stamps and poses before the state's
 
@@ -210,10 +205,7 @@ class LandmarkFilter:
         return np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4)
 
     def _predicted(self, stamp: float, rests: bool) -> Prediction:
-        """Go to a time, and say what is in the angle of view then; whether the camera rests meanwhile.
-
-        Features slide as the viewpoint changes: this widens the landmarks in view (`FilterState.advanced`).
-        """
+        """Go to a time, and say what is in the angle of view then; whether the camera rests meanwhile."""
         s = self.state
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
         motion: Motion = s.camera, np.eye(CAMERA), np.zeros((CAMERA, CAMERA))
@@ -221,7 +213,7 @@ class LandmarkFilter:
             motion = predicted(s.camera, self.models, s.covariance.camera, stamp - s.stamp, rests)
         T = motion[0].pose
         rows = self._measure.visible(T, s.landmarks.points)
-        after = s.advanced(float(stamp), motion, rows, *self._slide)
+        after = s.advanced(float(stamp), motion, rows, self._slide)
         marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
         by_pose = -toward @ (marks.gauge @ after.camera.displacement())  # (M, 3, 6), of them as seen from the camera

@@ -16,7 +16,7 @@ from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from backends.ekf.camera import Camera
-from backends.ekf.covariance import CAMERA, HEAD, POSE, Covariance
+from backends.ekf.covariance import CAMERA, HEAD, POSE, Covariance, reordered
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
@@ -159,58 +159,44 @@ class Linearisation:
         S[np.diag_indices(len(S))] += self.update.sigma**2
         return S
 
-    @cached_property
-    def L_inverse(self) -> Array:
-        """Of ``S = L Lᵀ`` (3M, 3M), lower triangular. Raises LinAlgError if S is not positive definite."""
-        upper, info = dpotrf(self.S.T)  # of the transpose, which is in the order that LAPACK wants
-        if info != 0:
-            raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
-        return np.asarray(upper_inverse(upper).T)
-
-    @cached_property
-    def information(self) -> Array:
-        """Blocks (M, 3, 3) on the diagonal of ``S⁻¹``."""
-        columns = self.L_inverse.reshape(len(self.L_inverse), len(self.z), 3).transpose(1, 2, 0)
-        return np.asarray(columns @ columns.transpose(0, 2, 1))
-
     def solved(self, used: BoolArray) -> Solution:
         """The update by some landmarks (mask (M,)). Raises LinAlgError if S is not positive definite."""
-        out = np.flatnonzero(np.repeat(~used, 3))
-        Q = self.L_inverse.T @ self.L_inverse[:, out]
-        root_inverse = np.linalg.inv(np.linalg.cholesky(Q[out]))
-        return Solution(self, used, out, root_inverse, Q @ root_inverse.T)
+        rows = np.argsort(np.repeat(~used, 3), kind="stable")
+        # of the transpose, which is in the order that LAPACK wants
+        upper, info = dpotrf(reordered(self.S, rows).T, overwrite_a=1)
+        if info != 0:
+            raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
+        k, inverse = 3 * np.count_nonzero(used), upper_inverse(upper).T
+        return Solution(self, used, rows[:k], rows[k:], inverse[:k, :k], inverse[k:, :k], upper[k:, k:].T)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The update by some of the landmarks, linearised somewhere.
+    """The update by some of the landmarks, linearised somewhere: K of them.
 
-    One factor of S serves any choice of them. With ``Q = S⁻¹`` and b the rows that are left out, the inverse of the
-    others' block of S is ``Q − E Eᵀ``, with ``E = Q_:b C⁻ᵀ`` and ``Q_bb = C Cᵀ``; in the rows b that is zero.
+    With their rows a before those of the others, b, the corner L_aa of ``S = L Lᵀ`` is their own factor. The others may
+    be off by anything: nothing but their distances depends on them.
     """
 
     at: Linearisation
     used: BoolArray  # which landmarks (M,)
-    out: IndexArray  # rows b (B,) of the innovation, of the others
-    root_inverse: Array  # C⁻¹ (B, B)
-    E: Array  # (3M, B)
+    rows: IndexArray  # a (3K,)
+    others: IndexArray  # b (B,)
+    L_inverse: Array  # (L⁻¹)_aa (3K, 3K), lower triangular
+    beneath: Array  # (L⁻¹)_ba (B, 3K)
+    rest: Array  # L_bb (B, B)
     linear: bool = True  # whether the measurements are so at the solution; not looked at where one linearisation is all
 
-    def weighted(self, X: Array) -> Array:
-        """``S⁻¹ X`` of some columns (3M, ...) by what is used alone; zero in the rows of what is not."""
-        L_inverse, X = self.at.L_inverse, self.of_used(X)
-        return self.of_used(L_inverse.T @ (L_inverse @ X) - self.E @ (self.E.T @ X))
-
-    def of_used(self, X: Array) -> Array:
-        """Columns (3M, ...) with zeros in the rows of what is not used: a wrong match may be off by anything."""
-        X = X.copy()
-        X[self.out] = 0.0
-        return X
+    def white(self, X: Array) -> Array:
+        """``L_aa⁻¹ X_a`` (3K, ...) of some columns X (3M, ...)."""
+        return np.asarray(self.L_inverse @ X[self.rows])
 
     @cached_property
     def y(self) -> Array:
-        """``S⁻¹ ν`` (3M,)."""
-        return self.weighted(self.at.nu)
+        """``S⁻¹ ν`` (3M,) of what is used alone; zero for the others."""
+        y = np.zeros(len(self.at.nu))
+        y[self.rows] = self.white(self.at.nu) @ self.L_inverse
+        return y
 
     @property
     def nis(self) -> float:
@@ -230,33 +216,33 @@ class Solution:
     @cached_property
     def pose_covariance(self) -> Array:
         """Of the error [r, φ] (6, 6) after the update, in the prior's coordinates."""
-        HP = self.at.HP[:, :POSE]
-        return np.asarray(self.at.update.covariance.pose - HP.T @ self.weighted(HP))
+        white = self.white(self.at.HP[:, :POSE])
+        return np.asarray(self.at.update.covariance.pose - white.T @ white)
 
-    def gain(self) -> tuple[Array, Array, Array]:
-        """V (n, 3M) and U (n, B) with ``V Vᵀ − U Uᵀ = K S Kᵀ``; and what errors of the rig change in the gain's errors.
+    def gain(self) -> tuple[Array, Array]:
+        """V (n, 3K) with ``V Vᵀ = K S Kᵀ``; and what errors of the rig change in the gain's errors.
 
         The last (n, m) is ``K (H x − F)`` with the derivatives x of the errors by those of the rig, and its field F.
         """
         at, update = self.at, self.at.update
-        V = dtrmm(1.0, at.L_inverse.T, at.HP.T, side=1)
+        V = dtrmm(1.0, self.L_inverse.T, at.HP[self.rows].T, side=1, overwrite_b=1)
         by_rig = at.H_times(update.covariance.by_rig[update.numbers])
         by_rig -= np.where(at.seen[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
-        return V, at.HP.T @ self.E, at.HP.T @ self.weighted(by_rig)
+        return V, V @ self.white(by_rig)
 
     @cached_property
     def distances(self) -> Array:
         """Squared distance (M,) of each landmark's measurement from what all others that are used predict.
 
-        With ``y_j`` and ``Q_j`` in the rows j of a landmark that is used, its innovation is off by ``Q_j⁻¹ y_j``, with
-        covariance ``Q_j⁻¹``: the distance is ``y_jᵀ Q_j⁻¹ y_j``. Those that are not used are off by ``ν_b + C⁻ᵀ Eᵀ ν``,
-        with ν of the others, and covariance ``Q_bb⁻¹ = C⁻ᵀ C⁻¹``. A landmark that is not seen has distance 0.
+        With ``y_j`` and ``Q_j = (S⁻¹)_jj`` in the rows j of a landmark that is used, its innovation is off by
+        ``Q_j⁻¹ y_j``, with covariance ``Q_j⁻¹``: the distance is ``y_jᵀ Q_j⁻¹ y_j``. Those that are not used are off by
+        ``ν_b + L_bb (L⁻¹)_ba ν_a``, with covariance ``L_bb L_bbᵀ``. A landmark that is not seen has distance 0.
         """
-        E, root = self.E.reshape(len(self.used), 3, len(self.out)), self.root_inverse
-        off, blocks = self.y.reshape(-1, 3).copy(), self.at.information - E @ E.transpose(0, 2, 1)
-        nu = self.at.nu
-        off[~self.used] = (nu[self.out] + self.of_used(nu) @ self.E @ root).reshape(-1, 3)
-        blocks[~self.used] = diagonal_blocks(root.T @ root)
+        used, nu, columns = self.used, self.at.nu, self.L_inverse.reshape(len(self.rows), len(self.rows) // 3, 3)
+        off, blocks = self.y.reshape(-1, 3).copy(), np.empty((len(used), 3, 3))
+        off[~used] = (nu[self.others] + self.rest @ (self.beneath @ nu[self.rows])).reshape(-1, 3)
+        blocks[used] = columns.transpose(1, 2, 0) @ columns.transpose(1, 0, 2)
+        blocks[~used] = diagonal_blocks(self.rest @ self.rest.T)
         found = squared_distances(off, blocks)
         if not np.isfinite(found).all():
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")

@@ -17,9 +17,11 @@ import numpy as np
 from slam.data import IdArray, IndexArray
 from slam.geometry.arrays import LandmarkRows
 from slam.geometry.se3 import Array, hat
+from slam.models import EstimatorModels
 
 _FARTHEST = 1e-6  # numerics: least inverse depth [1/m]
 _LEFT = 0.1  # share of its inverse depth that a landmark keeps at least in an update
+_UNCOUNTED = 0.1  # cost: variance of a slide that is not counted yet, as a share of the noise of a pixel
 _ASIDE = 1e3  # guard: largest |x/z|, |y/z|; 89.9 degrees from the axis of the camera that saw it first
 
 
@@ -122,6 +124,39 @@ class FilterLandmarks(LandmarkRows):
         points[rows] = coordinates.points(anchors, c[rows])
         gauge[rows] = gauge_jacobian(coordinates, anchors, c[rows], points[rows])
         return replace(self, c=c, points=points, gauge=gauge)
+
+
+@dataclass(frozen=True)
+class Slide:
+    """How features slide: from elsewhere the image looks like it at another point of the surface.
+
+    A landmark's direction walks at random with the angle between its lines of sight.
+    """
+
+    density: float  # standard deviation of the direction [rad / √rad], over the root of the angle; 0: none slides
+    unknown: float  # the angle [rad] where the earlier line is not known, as of a prior map
+    least: float  # smaller angles [rad] wait: a camera that stands seems to turn to and fro
+
+    @classmethod
+    def of(cls, models: EstimatorModels, f: float) -> Slide:
+        """By the focal length [px]. What of `pixel_sigma` is no noise of a frame is the slide up to the first sight."""
+        density, noise = models.slide.density, models.with_slide().pixel_sigma ** 2
+        angles = np.array([models.pixel_sigma**2 - noise, _UNCOUNTED * noise]) / (density**2 or np.inf)
+        return cls(density / f, *angles.tolist())
+
+    def walked(self, marks: FilterLandmarks, rows: IndexArray, r: Array) -> tuple[FilterLandmarks, Array]:
+        """Landmarks of which some rows (M,) are seen from r (3,), and by what covariance (M, 3, 3) those walk."""
+        if not self.density:
+            return marks, np.zeros((len(rows), 3, 3))
+        sight, sights, D = marks.points[rows] - r, marks.sights.copy(), marks.gauge[rows, :, :3]
+        distance = np.linalg.norm(sight, axis=1, keepdims=True)
+        cosine = (sight / distance * sights[rows]).sum(axis=1)
+        angle = np.where(np.isnan(cosine), self.unknown, np.arccos(np.clip(cosine, -1.0, 1.0)))
+        walk = np.isnan(cosine) | (angle > self.least)
+        sights[rows[walk]] = (sight / distance)[walk]
+        across = (distance**2)[:, :, None] * np.eye(3) - sight[:, :, None] * sight[:, None, :]
+        noise = (self.density**2 * np.where(walk, angle, 0.0))[:, None, None] * (D @ across @ D.transpose(0, 2, 1))
+        return replace(marks, sights=sights), noise
 
 
 def gauge_jacobian(coordinates: Coordinates, anchors: Array, c: Array, points: Array) -> Array:

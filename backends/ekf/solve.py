@@ -195,5 +195,5 @@ def _linear(found: Solution) -> bool:
     errors = np.where(now.seen & found.used[:, None], errors, 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
-    shift = found.weighted(errors.reshape(-1)) @ now.HP[:, :POSE]
+    shift = found.white(errors.reshape(-1)) @ found.white(now.HP[:, :POSE])
     return bool((shift**2 <= _POSE_SHARE**2 * found.pose_covariance.diagonal()).all())

@@ -10,7 +10,7 @@ from numpy.linalg import LinAlgError
 from backends.ekf.camera import Camera, Motion
 from backends.ekf.covariance import HEAD, Covariance
 from backends.ekf.innovation import Solution
-from backends.ekf.landmarks import Coordinates, FilterLandmarks
+from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
 
@@ -44,30 +44,11 @@ class FilterState:
         P = J @ self.covariance.pose @ J.T
         return np.asarray(0.5 * (P + P.T))
 
-    def advanced(
-        self, stamp: float, motion: Motion, rows: IndexArray, density: float, unknown: float = 0.0, least: float = 0.0
-    ) -> FilterState:
-        """At a later time, after a motion of the camera, which sees the landmarks of some rows (M,) then.
-
-        A feature is found where the image looks like it; from another viewpoint that is another point of the surface. A
-        landmark's direction walks at random with the angle between its lines of sight, by `density` [rad / √rad]; where
-        the earlier one is not known, as of a prior map, by as much as with an angle `unknown` [rad]. Angles of less
-        than `least` [rad] wait: a camera that stands seems to turn to and fro.
-        """
-        (camera, J, noise), landmarks, slide = motion, self.landmarks, None
-        if density:
-            sight, sights = landmarks.points[rows] - camera.pose[:3, 3], landmarks.sights.copy()
-            distance = np.linalg.norm(sight, axis=1, keepdims=True)
-            cosine = (sight / distance * sights[rows]).sum(axis=1)
-            angle = np.where(np.isnan(cosine), unknown, np.arccos(np.clip(cosine, -1.0, 1.0)))
-            some = angle > least
-            rows, sight, distance, angle = rows[some], sight[some], distance[some], angle[some]
-            across = (distance**2)[:, :, None] * np.eye(3) - sight[:, :, None] * sight[:, None, :]
-            D = landmarks.gauge[rows, :, :3]
-            slide = (density**2 * angle)[:, None, None] * (D @ across @ D.transpose(0, 2, 1))
-            sights[rows] = sight / distance
-            landmarks = replace(landmarks, sights=sights)
-        covariance = self.covariance.camera_moved(J, noise, self.camera.by_error(), rows, slide)
+    def advanced(self, stamp: float, motion: Motion, rows: IndexArray, slide: Slide) -> FilterState:
+        """At a later time, after a motion of the camera, which sees the landmarks of some rows (M,) then."""
+        camera, J, noise = motion
+        landmarks, walk = slide.walked(self.landmarks, rows, camera.pose[:3, 3])
+        covariance = self.covariance.advanced(J, noise, self.camera.by_error(), rows, walk)
         return FilterState(stamp, self.frame + 1, False, camera, landmarks, covariance)
 
     # --- landmarks join and leave ---

@@ -17,6 +17,7 @@ from experiments.corridor import run as corridor
 from slam.errors import ConfigurationError
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel, SlideModel, models_for
+from slam.third_party import OnlinePose, derived_recent
 from tests.backends.ekf_runs import FORWARD, MODELS, YAW, dense, halfway, nees, turning_drive
 from tests.backends.scenes import RIG, Scene, cloud, observe, path, random_path, run, scene, step
 from tests.slam.numeric import jacobian
@@ -132,6 +133,25 @@ def test_the_last_poses_are_known_together():
         low, high = chi2.ppf([0.001, 0.999], dof * runs) / runs
         assert low < np.mean(distances) < high
     assert len(backend.recent(1)) == 1 and len(backend.recent(100)) == 5
+
+
+def test_what_is_derived_of_the_last_poses_is_what_the_filter_knows():
+    """Of poses whose own covariance alone is told: the deviation of a motion over four frames."""
+    models, known, online, shares = models_for("handheld"), set(), [], []
+    data = scene(path(25, 0.1, 0.4 * FORWARD, 0.1 * YAW), points=900, sigma=models.pixel_sigma, limit=40)
+    backend = EkfBackend(RIG, models)
+    for stamp, _, seen in data:
+        used = step(backend, stamp, seen, known).used
+        pose = OnlinePose.seen(RIG, models.pixel_sigma, backend.estimate(False), seen.select(np.isin(seen.ids, used)))
+        online = [*online[-4:], pose]
+        told, derived = backend.recent(5), derived_recent(online)
+        J = np.concatenate([-se3.adjoint(se3.inverse(told.poses[-1]) @ told.poses[0]), np.eye(6)], axis=1)
+        ends = np.r_[0:6, -6:0]
+        P, Q = (J @ one.covariance[np.ix_(ends, ends)] @ J.T for one in (derived, told))
+        shares.append(np.sqrt(np.diag(P) / np.diag(Q)) if len(online) == 5 else np.ones(6))
+        np.testing.assert_allclose(derived.covariance[-6:, -6:], told.covariance[-6:, -6:], rtol=1e-6, atol=1e-11)
+        assert np.linalg.eigvalsh(derived.covariance).min() > -1e-11
+    np.testing.assert_allclose(np.median(shares[5:], axis=0), 1.0, atol=0.05)
 
 
 @pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])

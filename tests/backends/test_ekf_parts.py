@@ -13,7 +13,7 @@ from backends.ekf.backend import EkfConfig
 from backends.ekf.camera import predicted
 from backends.ekf.covariance import CAMERA, HEAD, Covariance
 from backends.ekf.innovation import Update
-from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth
+from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth, Slide
 from backends.ekf.motion import EulerCamera
 from backends.ekf.solve import gate, solve
 from backends.ekf.state import FilterState
@@ -178,16 +178,15 @@ def test_a_correction_and_its_transport():
     rng = np.random.default_rng(10)
     covariance, P = advanced(*grown(rng), rng)
     m, kept = HEAD + 33, np.s_[12:HEAD]
-    V, U = 0.1 * rng.standard_normal((m, 5)), 0.1 * rng.standard_normal((m, 2))
-    J, K = np.eye(CAMERA), rng.standard_normal((11, 3, 6))
+    V, J, K = 0.1 * rng.standard_normal((m, 5)), np.eye(CAMERA), rng.standard_normal((11, 3, 6))
     J[:3, 3:6] = rng.standard_normal((3, 3))
     expected = P.copy()
-    expected[:m, :m] -= V @ V.T - U @ U.T
+    expected[:m, :m] -= V @ V.T
     expected[kept, kept] = P[kept, kept]
     T = np.eye(len(P))
     T[:CAMERA, :CAMERA] = J
     T[HEAD:m, :CAMERA] = K.reshape(-1, 6) @ J[:6]
-    found = covariance.corrected(V, U, np.zeros((m, 0)), J, K)
+    found = covariance.corrected(V, np.zeros((m, 0)), J, K)
     assert_equal_to_rounding(whole(found), T @ expected @ T.T)
 
 
@@ -223,7 +222,7 @@ def test_the_prediction_is_as_printed():
     s, _, _ = state_of(4, InverseDepth())
     camera, P, dt = s.camera.x + 0.1 * np.arange(12.0) / 12, dense(s.covariance), 0.25
     s = replace(s, camera=replace(s.camera, x=camera))
-    found = s.advanced(dt, predicted(s.camera, MODELS, P[:12, :12], dt, False), np.arange(4), 0.0)
+    found = s.advanced(dt, predicted(s.camera, MODELS, P[:12, :12], dt, False), np.arange(4), Slide(0.0, 0.0, 0.0))
     A, W = np.eye(len(P)), np.zeros((len(P), 6))
     A[:6, 6:12] = dt * np.eye(6)
     W[:6], W[6:12] = dt * np.eye(6), np.eye(6)
@@ -393,8 +392,8 @@ def test_one_factor_serves_any_choice_of_landmarks():
     rows, solution = np.flatnonzero(np.repeat(used, 3)), at.solved(used)
     S, HP, nu = at.S[np.ix_(rows, rows)], at.HP[rows], at.nu[rows]
     np.testing.assert_allclose(solution.change, np.linalg.solve(S, HP).T @ nu, rtol=1e-8, atol=1e-12)
-    V, U, _ = solution.gain()
-    np.testing.assert_allclose(V @ V.T - U @ U.T, HP.T @ np.linalg.solve(S, HP), atol=1e-12 * np.abs(C).max())
+    V, _ = solution.gain()
+    np.testing.assert_allclose(V @ V.T, HP.T @ np.linalg.solve(S, HP), atol=1e-12 * np.abs(C).max())
     cross = at.S[3:6, rows]  # landmark 1 is left out
     off = at.nu[3:6] - cross @ np.linalg.solve(S, nu)
     conditional = at.S[3:6, 3:6] - cross @ np.linalg.solve(S, cross.T)
@@ -431,29 +430,31 @@ def test_no_linearisation_measures_a_displacement_of_the_world(coordinates, tran
 @pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
 def test_a_landmark_slides_across_its_line_of_sight_with_the_angle_of_view(coordinates):
     s, _, _ = state_of(4, coordinates)
-    density, rows, x = 0.01, np.array([0, 2]), s.camera.x.copy()
+    slide, rows, x = Slide(0.01, 0.0, 0.0), np.array([0, 2]), s.camera.x.copy()
     x[0] += 0.5
     there = replace(s, camera=replace(s.camera, x=x))
     first, now = (s.landmarks.points - T[:3, 3] for T in (s.pose, there.pose))
     size, distance = np.linalg.norm(first, axis=1), np.linalg.norm(now, axis=1)
     angle = np.arccos(np.einsum("ni,ni->n", first, now) / distance / size)
     unknown = replace(there, landmarks=replace(there.landmarks, sights=np.full((4, 3), np.nan)))
-    found = at_rest(there, rows, density)
+    found = at_rest(there, rows, slide)
     # no more until it is seen from elsewhere; on the way back it slides again
     for before, after, sight, by in (
-        (there, found, now, angle), (found, at_rest(found, rows, density, 0.0, 1e-6), now, 0 * angle),
-        (found, at_rest(replace(found, camera=s.camera), rows, density), first, angle),
-        (unknown, at_rest(unknown, rows, density, 0.3), now, np.full(4, 0.3)),
+        (there, found, now, angle), (found, at_rest(found, rows, replace(slide, least=1e-6)), now, 0 * angle),
+        (found, at_rest(replace(found, camera=s.camera), rows, slide), first, angle),
+        (unknown, at_rest(unknown, rows, replace(slide, unknown=0.3, least=1.0)), now, np.full(4, 0.3)),
     ):  # fmt: skip
         added = dense(after.covariance) - dense(before.covariance)
         for row in range(4):
             at = slice(CAMERA + 3 * row, CAMERA + 3 * row + 3)
             D = coordinates.jacobian(s.landmarks.anchors[row : row + 1], s.landmarks.c[row : row + 1])[0]
-            across = density**2 * by[row] * ((sight[row] @ sight[row]) * np.eye(3) - np.outer(sight[row], sight[row]))
+            across = (
+                slide.density**2 * by[row] * ((sight[row] @ sight[row]) * np.eye(3) - np.outer(sight[row], sight[row]))
+            )
             np.testing.assert_allclose(D @ added[at, at] @ D.T, across if row in rows else 0 * across, atol=1e-12)
             added[at, at] = 0
         assert not added.any()
 
 
-def at_rest(s: FilterState, *slide) -> FilterState:
-    return s.advanced(s.stamp + 0.1, (s.camera, np.eye(CAMERA), np.zeros((CAMERA, CAMERA))), *slide)
+def at_rest(s: FilterState, rows, slide: Slide) -> FilterState:
+    return s.advanced(s.stamp + 0.1, (s.camera, np.eye(CAMERA), np.zeros((CAMERA, CAMERA))), rows, slide)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from slam.errors import MeasurementError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.interfaces import MapBackend
-from slam.models import EstimatorModels
+from slam.models import EstimatorModels, SlideModel
 
 RIG = StereoRig.rectified_pair(f=400.0, u0=319.5, v0=239.5, baseline=0.2, width=640, height=480)
 SIGMA = 0.5
@@ -110,6 +112,26 @@ def test_what_is_inserted_and_never_seen_stays_as_it_is(name):
     backend.remove([5000])
     with pytest.raises(MeasurementError, match="5000"):
         backend.positions(np.array([5000]))
+
+
+@pytest.mark.parametrize("share", [0.4, 0.96, 1.0])
+def test_a_prior_maps_features_slide_up_to_the_first_sight_and_on(share):
+    """By what of the noise is none of a frame; nothing slides before a camera that stands and seems to sway."""
+    known = models(slide=SlideModel(3.0, share), initial_position_sigma=1e-6, initial_rotation_sigma=1e-6)
+    backend, point = backends.create("iekf", RIG, models=known), np.array([[0.0, 0.0, 5.0]])
+    backend.insert(np.array([7]), point, 1e-6 * np.eye(3)[None])
+
+    def walked(k: int, x: float) -> float:  # variance across the line of sight [px²], over what was known
+        if k:
+            s = backend.state
+            backend.state = replace(s, camera=s.camera.at(se3.pose(np.eye(3), [x, 0.0, 0.0])))
+        (backend.predict_at_rest if k else backend.predict)(DT * k)
+        return float((backend.estimate().covariances[0, 0, 0] - 1e-6) * (400.0 / 5) ** 2)
+
+    first = (1 - share**2) * SIGMA**2
+    for k in range(200):
+        assert walked(k, 5e-4 * (k % 2)) == pytest.approx(first, rel=1e-6, abs=1e-9)
+    assert walked(200, 0.5) == pytest.approx(first + 3.0**2 * np.arctan(0.1), rel=0.02)
 
 
 @pytest.mark.parametrize(("frames", "atol"), [(12, 1e-3), (30, 1e-2)])  # of 15 mm; with the lag, less is known
