@@ -125,8 +125,8 @@ FAULTS = (
         "J[3 + i, 9 + j] -= poses[i1, i, j] / d0", "J[3 + i, 9 + j] = -poses[i1, i, j] / d0",
     ),
     Fault(
-        "the earlier velocity is taken over the later interval", "backends/batch.py",
-        "before = float(dt[i - 1]) if i else None", "before = interval if i else None",
+        "the earlier velocity is taken over the later interval", "backends/smoother/state.py",
+        "return dt[-1], dt[0] if number - 2", "return dt[-1], dt[-1] if number - 2",
     ),
     # tracks
     Fault(

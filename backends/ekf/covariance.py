@@ -156,7 +156,7 @@ class Covariance:
         """
         last, by_rig, D = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), CAMERA))
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
-        mirror(P[:CAMERA, :CAMERA])
+        mirror(P, CAMERA)
         D[:CAMERA], D[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
         # with T = 1 + [D, 0]: T P Tᵀ = P + D Yᵀ + Y Dᵀ,  Y = P[:, :12] + D P_cc / 2
         half = 0.5 * D @ P[:CAMERA, :CAMERA]
@@ -165,7 +165,7 @@ class Covariance:
         P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]
         summands = self.P.diagonal() + 2 * (half * D).sum(axis=1)
         summands[last] = 0.0
-        mirror(P)
+        mirror(P, len(P))
         return replace(self, P=positive(P, summands, V.shape[1]), by_rig=by_rig)
 
     def displaced(self, rows: IndexArray, change: Array, shift: Array) -> Covariance:
@@ -180,9 +180,8 @@ class Covariance:
 
 
 @kernel
-def mirror(P: Array) -> None:
-    """The lower triangle of P (n, n) also above its diagonal, in place."""
-    n = len(P)
+def mirror(P: Array, n: int) -> None:
+    """The lower triangle of the first n rows and columns of P also above its diagonal, in place."""
     for first in range(0, n, _BLOCK):
         for left in range(0, first + 1, _BLOCK):
             for i in range(first, min(first + _BLOCK, n)):

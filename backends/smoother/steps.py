@@ -162,9 +162,8 @@ class Steps(RectifiedMeasurement):
 
     def _saw_the_same(self, s: SmootherState, serials: IdArray) -> bool:
         """Whether the newest pose measured at least half of what the last one in the graph did, not long ago."""
-        if not s.begun <= s.solved or s.number - s.solved > min(self.track // 2, _DARK - 1):
-            return False
-        last = s.sights[s.of(s.solved)].serials
+        near = s.begun <= s.solved and s.number - s.solved <= min(self.track // 2, _DARK - 1)
+        last = s.sights[s.of(s.solved)].serials if near else serials[:0]
         return bool(np.isin(last, serials).sum() > _SAME * len(last))
 
     def settled(self, s: SmootherState, solved: Solved) -> SmootherState:
@@ -230,9 +229,8 @@ class Steps(RectifiedMeasurement):
         A landmark is carried by the poses that measured it last: of a long path a part at a time is enough.
         """
         marks, last = s.landmarks, max(s.anchor, s.solved)
-        C, newest = np.zeros((len(rows), 3, 3)), marks.pose[rows].max(axis=1, initial=-1)
-        oldest = s.oldest(self.config.lag, s.number)
-        newest = np.where(newest < 0, last, newest).clip(oldest, last)
+        newest, oldest = marks.pose[rows].max(axis=1, initial=-1), s.oldest(self.config.lag, s.number)
+        C, newest = np.zeros((len(rows), 3, 3)), np.where(newest < 0, last, newest).clip(oldest, last)
         for begin in range(oldest, last + 1, _PART):
             here, end = np.flatnonzero((newest >= begin) & (newest < begin + _PART)), min(begin + _PART - 1, last)
             if len(here):
