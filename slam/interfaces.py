@@ -138,7 +138,8 @@ class RecentBackend(Protocol):
     """Additional method of a back end that knows how the errors of the camera's last poses hang together.
 
     Moving bodies need it, a velocity is the difference of two poses, and so does the judgement of covariances. Of a
-    back end without it the joint covariance is derived from the poses' own ones (`slam.third_party.derived_recent`).
+    back end without it the joint covariance is derived from the poses' own ones, approximately
+    (`slam.third_party.derived_recent`).
     """
 
     def recent(self, n: int) -> RecentPoses:

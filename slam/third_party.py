@@ -15,13 +15,12 @@ import numpy as np
 from slam.checks import LATEST_STAMP, is_rigid
 from slam.data import Estimate, Observations, Patches, Prediction, RecentPoses, UpdateReport, UpdateStatus
 from slam.errors import AnswerError, PartError, SlamError, cause
-from slam.geometry.rig import MINIMAL_POINTS, StereoRig
+from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, RecentBackend
 
 _LEAST = 1e-12  # numerics: variance [rad²], [m²] of a pose that is known for certain
-_HARDLY = 1e-6 * np.eye(6)  # numerics: information of a pose that nothing has measured
 _OURS = ("slam", "backends", "frontends", "builtins")
 
 #: What each method answers: a type, and the types or shapes of its attributes. Equal letters stand for equal numbers,
@@ -98,23 +97,24 @@ class OnlinePose:
 
     @cached_property
     def noise(self) -> Array:
-        """Covariance (6, 6) by the frame's own noise: what the landmarks would leave uncertain if they were known.
+        """Covariance (6, 6) by the frame's own noise, which a pose of covariance Σ has taken over by a gain K.
 
-        A pose that too few have measured to determine it has the error that was before, and what the motion added.
+        If the landmarks were known they alone would leave N uncertain. A pose that is surer than N has it from before,
+        too: ``K = Σ N⁻¹``. Otherwise the landmarks are as unsure as the pose, and K = 1. ``K N Kᵀ`` is the smaller of
+        ``Σ N⁻¹ Σ`` and N in each direction, and zero where nothing is measured.
         """
-        if len(self.landmarks) < MINIMAL_POINTS:
-            return np.zeros((6, 6))
         J = (self.rig.project_stereo(self.landmarks)[1] @ points_by_pose(self.landmarks)).reshape(-1, 6)
-        return at_most(np.linalg.inv(J.T @ J / self.sigma**2 + _HARDLY), self.estimate.covariance)
+        axes, deviations = _axes(self.estimate.covariance)
+        root = axes * deviations
+        shares, turn = np.linalg.eigh(root.T @ (J.T @ J / self.sigma**2) @ root)
+        root, shares = root @ turn, shares.clip(min=0.0)
+        return np.asarray((root * (shares / np.maximum(shares, 1.0) ** 2)) @ root.T)
 
 
-def at_most(P: Array, most: Array) -> Array:
-    """What of a covariance P (6, 6) is no more than another one, in whatever direction."""
-    values, axes = np.linalg.eigh(most)
-    deviations = np.sqrt(values.clip(min=_LEAST))
-    shares, turn = np.linalg.eigh((axes / deviations).T @ P @ (axes / deviations))
-    axes = (axes * deviations) @ turn
-    return np.asarray((axes * shares.clip(0.0, 1.0)) @ axes.T)
+def _axes(P: Array) -> tuple[Array, Array]:
+    """Axes (6, 6) of a covariance, and the standard deviations (6,) along them."""
+    values, axes = np.linalg.eigh(P)
+    return axes, np.sqrt(values.clip(min=_LEAST))
 
 
 def recent_of(backend: Backend, path: Sequence[OnlinePose]) -> RecentPoses:
@@ -139,7 +139,10 @@ def derived_recent(path: Sequence[OnlinePose]) -> RecentPoses:
         lasting: Array = one.estimate.covariance - one.noise
         if i + 1 < len(path):
             back = adjoint(inverse(poses[i]) @ poses[i + 1])
-            lasting = at_most(lasting, back @ common @ back.T)
+            axes, deviations = _axes(back @ common @ back.T)
+            shares, turn = np.linalg.eigh((axes / deviations).T @ lasting @ (axes / deviations))
+            axes = (axes * deviations) @ turn
+            lasting = (axes * shares.clip(0.0, 1.0)) @ axes.T
         common, own = lasting, slice(6 * i, 6 * i + 6)
         P[own, 6 * i :] = common @ adjoint(inverse(poses[i:]) @ poses[i]).reshape(-1, 6).T
         P[6 * i :, own] = P[own, 6 * i :].T

@@ -8,8 +8,7 @@ much says `Camera.displacement`. What a displacement of the world changes in a l
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Protocol, Self
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -86,24 +85,17 @@ def predicted(camera: Camera, models: EstimatorModels, P: Array, dt: float, rest
     if rests:
         return camera.stopped(), _AT_REST, np.zeros_like(P)
     if _any_attitude(models, P, dt):
-        sigmas = min(models.initial_velocity_sigma * dt, ANYWHERE), np.pi / np.sqrt(3), *_velocity_sigmas(models)
-        return camera.stopped(), _POSITION, camera.of_body(diagonal(sigmas))
+        pose = min(models.initial_velocity_sigma * dt, ANYWHERE), np.pi / np.sqrt(3)
+        return camera.stopped(), _POSITION, camera.of_body(prior(models, pose))
     camera, A, W = camera.advanced(dt)
     return camera, A, (W * np.repeat(models.motion.velocity_variance(dt), 3)) @ W.T
 
 
-def prior(models: EstimatorModels) -> Array:
-    """The first camera's covariance (12, 12) of position, attitude, velocity, and body rate."""
-    return diagonal((models.initial_position_sigma, models.initial_rotation_sigma, *_velocity_sigmas(models)))
-
-
-def _velocity_sigmas(models: EstimatorModels) -> tuple[float, float]:
-    return models.initial_velocity_sigma, models.initial_angular_velocity_sigma
-
-
-def diagonal(sigmas: Sequence[Any]) -> Array:
-    """Covariance (12, 12) of three numbers for each of four standard deviations."""
-    return np.diag(np.repeat(np.array(sigmas) ** 2, 3))
+def prior(models: EstimatorModels, pose: tuple[float, float] | None = None) -> Array:
+    """Covariance (12, 12) of the first camera, or of one with other standard deviations of the pose [m], [rad]."""
+    pose = pose or (models.initial_position_sigma, models.initial_rotation_sigma)
+    sigmas = *pose, models.initial_velocity_sigma, models.initial_angular_velocity_sigma
+    return np.diag(np.repeat(np.square(sigmas), 3))
 
 
 def _any_attitude(models: EstimatorModels, P: Array, dt: float) -> bool:
