@@ -152,6 +152,9 @@ def test_what_is_derived_of_the_last_poses_is_what_the_filter_knows():
         np.testing.assert_allclose(derived.covariance[-6:, -6:], told.covariance[-6:, -6:], rtol=1e-6, atol=1e-11)
         assert np.linalg.eigvalsh(derived.covariance).min() > -1e-11
     np.testing.assert_allclose(np.median(shares[5:], axis=0), 1.0, atol=0.05)
+    N = replace(pose, estimate=replace(pose.estimate, covariance=1e2 * np.eye(6))).noise
+    surer = replace(pose, estimate=replace(pose.estimate, covariance=0.1 * N))  # it has a tenth of the frame's error
+    np.testing.assert_allclose(surer.noise, 0.01 * N, rtol=1e-3, atol=1e-5 * np.abs(N).max())
 
 
 @pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])

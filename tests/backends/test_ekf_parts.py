@@ -385,7 +385,7 @@ def test_a_distance_is_by_how_much_the_nis_falls_without_a_landmark():
         assert without.distances[gone] == pytest.approx(every.distances[gone], rel=1e-6)
 
 
-def test_one_factor_serves_any_choice_of_landmarks():
+def test_an_update_by_some_landmarks_depends_on_no_others():
     """Against the formulas of S, ν and H of the used ones alone."""
     _, update = far_off(1)
     at, used, C = gate(update).at, np.arange(12) % 3 != 1, update.covariance.P
