@@ -58,6 +58,23 @@ _inside: set[object] = set()  # a token of each call that is under way
 _before: list[tuple[LibController, int]] = []  # what the last one out sets back
 
 
+def _enter(call: object) -> None:
+    """One thread from here on."""
+    _inside.add(call)
+    for library in _blas(len(sys.modules)):
+        if (threads := library.get_num_threads()) != 1:
+            _before.append((library, threads))
+            _set(library, 1)
+
+
+def _leave(call: object) -> None:
+    """As many threads as before, if this is the last one out."""
+    _inside.discard(call)
+    while _before and not _inside:
+        _set(*_before[-1])
+        _before.pop()
+
+
 def one_blas_thread(function: _F) -> _F:
     """Run with one BLAS thread, in whatever thread of Python's; the last of several calls out sets back what was.
 
@@ -68,20 +85,11 @@ def one_blas_thread(function: _F) -> _F:
     @wraps(function)
     def limited(*args: Any, **kwargs: Any) -> Any:
         call = object()
-        try:
-            with _lock:
-                _inside.add(call)
-                for library in _blas(len(sys.modules)):
-                    if (threads := library.get_num_threads()) != 1:
-                        _before.append((library, threads))
-                        _set(library, 1)
+        try:  # the lock is held for one line: an interrupt between two would leave it locked
+            with _lock: _enter(call)  # fmt: skip  # noqa: E701
             return function(*args, **kwargs)
         finally:
-            with _lock:
-                _inside.discard(call)
-                while _before and not _inside:
-                    _set(*_before[-1])
-                    _before.pop()
+            with _lock: _leave(call)  # fmt: skip  # noqa: E701
 
     return limited  # type: ignore[return-value]
 
