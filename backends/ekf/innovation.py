@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dpotrs
 
-from backends.ekf.camera import Camera
+from backends.ekf.camera import Camera, displacement, transport
 from backends.ekf.covariance import CAMERA, HEAD, POSE, Covariance, reordered
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.data import BoolArray, IndexArray
@@ -58,7 +58,7 @@ class Update:
     @cached_property
     def lever(self) -> Array:
         """That (M, 3, 6) of the prior, see the module."""
-        return self.landmarks.gauge @ self.camera.displacement()
+        return self.landmarks.gauge @ displacement(self.camera)
 
     @cached_property
     def gauge_projector(self) -> Array | None:
@@ -84,7 +84,7 @@ class Update:
         A landmark is at ``h = Rᵀ (Y − r)`` (paper B, Eqs. 3-5).
         """
         there, marks = camera or self.camera, self.landmarks
-        J = np.eye(CAMERA) if camera is None else self.camera.transport(camera)
+        J = np.eye(CAMERA) if camera is None else transport(self.camera, camera)
         change = np.zeros(len(self.covariance.P))
         if camera is not None:
             change[:CAMERA] = np.linalg.solve(J, there.minus(self.camera))
@@ -99,7 +99,7 @@ class Update:
         own = by_point @ (R.T @ self.coordinates.jacobian(marks.anchors, marks.c))
         own = np.where(seen[:, :, None], own, 0.0)
         # an error that is transported displaces the world by the same, wherever it is written
-        lever = marks.gauge @ (self.camera if self.camera.transports else there).displacement()
+        lever = marks.gauge @ displacement(self.camera if self.camera.transports else there)
         return Linearisation(self, there, J, change, z, seen, own, lever)
 
 

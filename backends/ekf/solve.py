@@ -24,7 +24,7 @@ import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg.lapack import dpotrf
 
-from backends.ekf.camera import prior
+from backends.ekf.camera import of_body, prior
 from backends.ekf.covariance import CAMERA, HEAD, POSE
 from backends.ekf.innovation import Linearisation, Solution, Update, diagonal_blocks
 from slam.data import BoolArray
@@ -86,7 +86,7 @@ def _restarted(update: Update, search: Search, least: int) -> Solution | None:
         return None
     before, there = update.camera.pose, update.facing(T)
     far, turned = np.linalg.norm(T[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ T[:3, :3])
-    noise = there.camera.of_body(prior(update.measure.models, (float(far), float(turned))))
+    noise = of_body(there.camera, prior(update.measure.models, (float(far), float(turned))))
     there = replace(there, covariance=there.covariance.camera_moved(np.eye(CAMERA), noise))
     with suppress(LinAlgError):
         found = solve(gate(there, T))
