@@ -50,7 +50,7 @@ class Camera(Protocol):
     def at(self, T: Array) -> Self:
         """At another pose (4, 4), with the same velocities."""
 
-    def facing(self, T: Array) -> tuple[Self, Array]:
+    def regular_towards(self, T: Array) -> tuple[Self, Array]:
         """The same camera, with an error that is regular from here to a pose T; its derivative (12, 12) by this one's.
 
         The camera itself where its error is regular there as it is.
@@ -63,7 +63,7 @@ class Camera(Protocol):
         """With the same pose, and no velocity."""
 
 
-def by_error(camera: Camera) -> Array:
+def pose_by_error(camera: Camera) -> Array:
     """Derivative (6, 6) of the pose's right perturbation [rotation, translation] by the pose's error."""
     J, back = np.zeros((POSE, POSE)), camera.pose[:3, :3].T
     J[:3, 3:], J[3:, :3] = back @ camera.turning, back
@@ -90,7 +90,7 @@ def transport(camera: Camera, to: Camera) -> Array:
     return J
 
 
-def of_body(camera: Camera, P: Array) -> Array:
+def from_body_axes(camera: Camera, P: Array) -> Array:
     """A covariance (12, 12) with turns and rates about the body's axes, the same about all, as one of the error."""
     E = np.eye(CAMERA)
     E[3:6, 3:6] = E[9:, 9:] = np.linalg.solve(camera.turning, camera.pose[:3, :3])
@@ -113,7 +113,7 @@ def predicted(camera: Camera, models: EstimatorModels, P: Array, dt: float, rest
         return camera.stopped(), _AT_REST, np.zeros_like(P)
     if _any_attitude(models, P, dt):
         pose = min(models.initial_velocity_sigma * dt, ANYWHERE), np.pi / np.sqrt(3)
-        return camera.stopped(), _POSITION, of_body(camera, prior(models, pose))
+        return camera.stopped(), _POSITION, from_body_axes(camera, prior(models, pose))
     camera, A, W = camera.advanced(dt)
     return camera, A, (W * np.repeat(models.motion.velocity_variance(dt), 3)) @ W.T
 

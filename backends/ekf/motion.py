@@ -123,7 +123,7 @@ class EulerCamera:
         """See `Camera`."""
         return replace(self, x=np.concatenate([self.x[:POSE], np.zeros(POSE)]))
 
-    def facing(self, T: Array) -> tuple[EulerCamera, Array]:
+    def regular_towards(self, T: Array) -> tuple[EulerCamera, Array]:
         """See `Camera`."""
         sine = self.R_world_angles[:, 2] @ T[:3, 0]  # −sin φy
         return self.reanchored(T) if abs(sine) > math.sin(LIMIT) else (self, np.eye(CAMERA))

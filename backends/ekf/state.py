@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from backends.ekf.camera import Camera, Motion, by_error, displacement, transport
+from backends.ekf.camera import Camera, Motion, displacement, pose_by_error, transport
 from backends.ekf.covariance import HEAD, Covariance
-from backends.ekf.innovation import Solution
+from backends.ekf.innovation import Correction
 from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
@@ -40,7 +40,7 @@ class FilterState:
 
     def pose_covariance(self) -> Array:
         """Covariance (6, 6) of the pose's right perturbation."""
-        J = by_error(self.camera)
+        J = pose_by_error(self.camera)
         P = J @ self.covariance.pose @ J.T
         return np.asarray(0.5 * (P + P.T))
 
@@ -48,7 +48,7 @@ class FilterState:
         """At a later time, after a motion of the camera, which sees the landmarks of some rows (M,) then."""
         camera, J, noise = motion
         landmarks, walk = slide.walked(self.landmarks, rows, camera.pose[:3, 3])
-        covariance = self.covariance.advanced(J, noise, by_error(self.camera), rows, walk)
+        covariance = self.covariance.advanced(J, noise, pose_by_error(self.camera), rows, walk)
         return FilterState(stamp, self.frame + 1, False, camera, landmarks, covariance)
 
     # --- landmarks join and leave ---
@@ -104,7 +104,7 @@ class FilterState:
 
     # --- updates ---
 
-    def corrected(self, found: Solution) -> FilterState:
+    def corrected(self, found: Correction) -> FilterState:
         """After an update.
 
         A displacement of camera and landmarks together is unobservable. What it changes in each coordinate depends on

@@ -72,7 +72,7 @@ class InvariantCamera:
         """See `Camera`."""
         return replace(self, v=np.zeros(3), rate=np.zeros(3))
 
-    def facing(self, T: Array) -> tuple[InvariantCamera, Array]:
+    def regular_towards(self, T: Array) -> tuple[InvariantCamera, Array]:
         """See `Camera`: its error is regular everywhere."""
         return self, np.eye(CAMERA)
 

@@ -10,12 +10,12 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from backends.ekf.backend import EkfConfig
-from backends.ekf.camera import by_error, displacement, of_body, predicted, prior
+from backends.ekf.camera import displacement, from_body_axes, pose_by_error, predicted, prior
 from backends.ekf.covariance import CAMERA, HEAD, Covariance
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth, Slide
 from backends.ekf.motion import EulerCamera
-from backends.ekf.solve import gate, solve
+from backends.ekf.solve import gate, gated_correction
 from backends.ekf.state import FilterState
 from backends.iekf.filter import InvariantCamera
 from slam.geometry import se3
@@ -48,7 +48,7 @@ def test_the_pose_by_the_error(camera):
     def perturbation(xi):
         return se3.log(se3.inverse(camera.pose) @ camera.moved(np.pad(xi, (0, 6))).pose)
 
-    np.testing.assert_allclose(by_error(camera), jacobian(perturbation, np.zeros(6)), atol=1e-8)
+    np.testing.assert_allclose(pose_by_error(camera), jacobian(perturbation, np.zeros(6)), atol=1e-8)
     error = 0.3 * RNG.standard_normal(12)
     np.testing.assert_allclose(camera.moved(error).minus(camera), error, atol=1e-12)
 
@@ -204,7 +204,7 @@ def state_of(landmarks: int, coordinates) -> tuple[FilterState, np.ndarray, np.r
     rng = np.random.default_rng(5)
     h = rng.uniform((-2, -1.5, 4), (2, 1.5, 9), (landmarks, 3))
     camera = EulerCamera.first(MODELS, False)
-    P = of_body(camera, prior(MODELS))
+    P = from_body_axes(camera, prior(MODELS))
     camera = replace(camera, x=np.concatenate([rng.standard_normal(3), ATTITUDES[1], np.zeros(6)]))
     s = replace(FilterState.first(camera, P), stamp=0.0, frame=0)
     s = replace(s, covariance=s.covariance.camera_moved(np.eye(CAMERA), 1e-4 * positive(CAMERA, rng)))
@@ -243,7 +243,7 @@ def test_the_update_is_the_joseph_form(coordinates):
     P, marks = dense(s.covariance), s.landmarks
     z = RIG.project_stereo(h + 0.01 * rng.standard_normal(h.shape))[0] + 0.3 * rng.standard_normal((12, 3))
     update = update_of(s, z, coordinates, 1)
-    solution = solve(gate(update))
+    solution = gated_correction(gate(update))
     assert solution.used.all()
     x = np.concatenate([s.camera.x, marks.c.reshape(-1)])
 
@@ -304,7 +304,7 @@ def far_off(iterations: int, spread: float = 0.05) -> tuple[FilterState, Update]
 
 def ungated(update: Update):
     """What all measurements give, whether they agree or not."""
-    return solve(replace(gate(update), limits=np.full(12, 1e9)))
+    return gated_correction(replace(gate(update), limits=np.full(12, 1e9)))
 
 
 def corrected(s: FilterState, update: Update) -> np.ndarray:
@@ -360,7 +360,7 @@ def test_depths_that_move_do_not_bend_the_pose():
     off = []
     for seed in range(100):
         s, update, truth = far_in_depth(seed)
-        after = s.corrected(solve(replace(gate(update), limits=np.full(15, 1e9))))
+        after = s.corrected(gated_correction(replace(gate(update), limits=np.full(15, 1e9))))
         off.append(np.linalg.norm(after.pose[:3, 3] - truth[:3, 3]))
     assert (
         max(off) < 0.1 and np.sqrt(np.mean(np.square(off))) < 0.035
