@@ -227,7 +227,7 @@ def test_the_prediction_is_as_printed():
     s, _, _ = state_of(4, InverseDepth())
     camera, P, dt = s.camera.x + 0.1 * np.arange(12.0) / 12, dense(s.covariance), 0.25
     s = replace(s, camera=replace(s.camera, x=camera))
-    found = s.advanced(dt, predicted(s.camera, MODELS, P[:12, :12], dt, False), np.arange(4), Slide(0.0, 0.0, 0.0))
+    found = s.advanced(dt, predicted(s.camera, MODELS, P[:12, :12], dt, False))
     A, W = np.eye(len(P)), np.zeros((len(P), 6))
     A[:6, 6:12] = dt * np.eye(6)
     W[:6], W[6:12] = dt * np.eye(6), np.eye(6)
@@ -442,12 +442,13 @@ def test_a_landmark_slides_across_its_line_of_sight_with_the_angle_of_view(coord
     size, distance = np.linalg.norm(first, axis=1), np.linalg.norm(now, axis=1)
     angle = np.arccos(np.einsum("ni,ni->n", first, now) / distance / size)
     unknown = replace(there, landmarks=replace(there.landmarks, sights=np.full((4, 3), np.nan)))
-    found = at_rest(there, rows, slide)
+    found = there.slid(slide, rows, there.pose[:3, 3])
     # no more until it is seen from elsewhere; on the way back it slides again
     for before, after, sight, by in (
-        (there, found, now, angle), (found, at_rest(found, rows, replace(slide, least=1e-6)), now, 0 * angle),
-        (found, at_rest(replace(found, camera=s.camera), rows, slide), first, angle),
-        (unknown, at_rest(unknown, rows, replace(slide, unknown=0.3, least=1.0)), now, np.full(4, 0.3)),
+        (there, found, now, angle),
+        (found, found.slid(replace(slide, least=1e-6), rows, there.pose[:3, 3]), now, 0 * angle),
+        (found, found.slid(slide, rows, s.pose[:3, 3]), first, angle),
+        (unknown, unknown.slid(replace(slide, unknown=0.3, least=1.0), rows, there.pose[:3, 3]), now, np.full(4, 0.3)),
     ):  # fmt: skip
         added = dense(after.covariance) - dense(before.covariance)
         for row in range(4):
@@ -459,7 +460,3 @@ def test_a_landmark_slides_across_its_line_of_sight_with_the_angle_of_view(coord
             np.testing.assert_allclose(D @ added[at, at] @ D.T, across if row in rows else 0 * across, atol=1e-12)
             added[at, at] = 0
         assert not added.any()
-
-
-def at_rest(s: FilterState, rows, slide: Slide) -> FilterState:
-    return s.advanced(s.stamp + 0.1, (s.camera, np.eye(CAMERA), np.zeros((CAMERA, CAMERA))), rows, slide)
