@@ -53,7 +53,8 @@ class FilterState:
     def slid(self, slide: Slide, rows: IndexArray, r: Array) -> FilterState:
         """With landmarks of some rows (M,) of the state seen from r (3,), and their features slid there."""
         landmarks, walk = slide.walked(self.landmarks, rows, r)
-        return replace(self, landmarks=landmarks, covariance=self.covariance.walked(rows, walk)) if walk.any() else self
+        covariance = self.covariance.walked(rows, walk) if walk.any() else self.covariance
+        return replace(self, landmarks=landmarks, covariance=covariance)
 
     # --- landmarks join and leave ---
 
