@@ -28,6 +28,7 @@ from slam.window.stereo import TOO_LATE, Field, RectifiedMeasurement
 
 #: Standard deviations of a known point between it and its anchor: its coordinates are linear there, it stays Gaussian.
 _STAND_OFF = 100.0
+_FARTHEST_ANCHOR = 1e5  # numerics: from a known point [m]; a landmark's inverse depth keeps clear of its least
 _DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large
 
 
@@ -140,7 +141,8 @@ class LandmarkFilter:
         ids, positions, covariances = known
         anchors = np.tile(np.eye(3, 4), (len(ids), 1, 1))
         anchors[:, :, 3] = positions
-        anchors[:, 2, 3] -= np.maximum(_STAND_OFF * np.sqrt(np.trace(covariances, axis1=1, axis2=2)), 1.0)
+        deviations = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+        anchors[:, 2, 3] -= np.clip(_STAND_OFF * deviations, 1.0, _FARTHEST_ANCHOR)
         new = FilterLandmarks.at(self._coordinates, ids, anchors, positions)
         new = replace(new, sights=np.full((len(ids), 3), np.nan))
         D = new.gauge[:, :, :3]

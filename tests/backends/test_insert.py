@@ -113,6 +113,15 @@ def test_what_is_inserted_and_never_seen_stays_as_it_is(name):
         backend.positions(np.array([5000]))
 
 
+@pytest.mark.parametrize("name", ["ekf", "iekf"])
+def test_landmarks_of_which_next_to_nothing_is_known_agree_with_what_is_seen(name):
+    scene = Scene(1)
+    backend = backends.create(name, RIG, models=models(T_world_left=START))
+    backend.insert(scene.ids, scene.points, np.tile(1e8 * np.eye(3), (40, 1, 1)))  # to 10 km; all were refused
+    backend.predict(0.0)
+    assert len(backend.update(scene.seen[0]).used) == len(scene.seen[0])
+
+
 @pytest.mark.parametrize("share", [0.4, 0.96, 1.0])
 def test_a_prior_maps_features_slide_up_to_the_first_sight_and_on(share):
     """By what of the noise is none of a frame; nothing slides before a camera that stands and seems to sway."""
