@@ -1,4 +1,4 @@
-"""All settings of a run in one frozen, validated tree; written as plain JSON."""
+"""All settings of a run in one frozen, validated tree; read from and written to plain JSON."""
 
 from __future__ import annotations
 
@@ -83,6 +83,15 @@ class SystemConfig:
     def to_json(self) -> dict[str, Any]:
         """The tree as plain types."""
         return asdict(self)
+
+    @classmethod
+    def from_json(cls, tree: Mapping[str, Any]) -> SystemConfig:
+        """The configuration of a tree as `to_json` gives it, such as the settings in a run's ``config.json``.
+
+        Raises:
+            ConfigurationError: a key is unknown, or a value is of the wrong type or out of range.
+        """
+        return cls().with_settings(tree)
 
     def with_settings(self, settings: Sequence[str] | Mapping[str, Any]) -> SystemConfig:
         """A copy with settings applied: ``{"map.max_landmarks": 300}``, or ``["map.max_landmarks=300"]``.

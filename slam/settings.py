@@ -32,12 +32,13 @@ SETTABLE: dict[str, tuple[str, ...]] = {
 def with_changes(config: _C, settings: Sequence[str] | Mapping[str, Any]) -> _C:
     """A configuration with other values of some settings, converted and checked by its classes.
 
-    Settings are texts such as ``"map.max_landmarks=300"``, whose values are JSON or plain words; or values by key.
+    Settings are texts such as ``"map.max_landmarks=300"``, whose values are JSON or plain words; or values by key, or
+    by section and key.
     Raises ConfigurationError where a text is not of that form, a section or key is unknown, or a value is refused.
     """
     given: list[tuple[str, Any, str]] = []  # keys, values, and both as they were given
     if isinstance(settings, Mapping):
-        given = [(str(key), value, f"{key}={value}") for key, value in settings.items()]
+        given = [(key, value, f"{key}={value}") for key, value in leaves(settings)]
     elif not isinstance(settings, (list, tuple)) or not all(isinstance(setting, str) for setting in settings):
         raise ConfigurationError("settings must be a list of texts section.key=value, or a dict of values by key")
     else:
@@ -46,7 +47,7 @@ def with_changes(config: _C, settings: Sequence[str] | Mapping[str, Any]) -> _C:
             if not equals:
                 raise ConfigurationError(f"setting {setting!r} is not of the form section.key=value")
             given.append((key.strip(), _value(text.strip()), setting))
-    known, changes = list(leaves(asdict(config))), dict[str, Any]()
+    known, changes = list(dict(leaves(asdict(config)))), dict[str, Any]()
     for key, value, setting in given:
         section, dot, option = key.partition(".")
         if section in _FREE and dot:
@@ -97,7 +98,7 @@ def require_settable(settings: Iterable[str], tree: Mapping[str, Any], frontend:
 
     `tree` is the configuration that they are for, `frontend` the name of the front end. Raises ConfigurationError.
     """
-    known = set(leaves(dict(tree)))
+    known = dict(leaves(tree))
     for key in (text.partition("=")[0].strip() for text in settings):
         own = key.startswith("frontend.") and frontend in SETTABLE
         if (key in known or own) and not can_be_set(key, frontend if own else ""):
@@ -133,10 +134,10 @@ def _unknown(key: str, known: Sequence[str]) -> str:
     return f"unknown {what} {name!r} (did you mean {' or '.join(map(repr, elsewhere))}?); known: {', '.join(names)}"
 
 
-def leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[str]:
-    """Dotted names of all settings in a configuration's tree, such as ``"map.grid"``."""
+def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names of all settings in a configuration's tree, such as ``"map.grid"``, and their values."""
     for key, value in tree.items():
         if isinstance(value, dict):
             yield from leaves(value, f"{prefix}{key}.")
         else:
-            yield f"{prefix}{key}"
+            yield f"{prefix}{key}", value

@@ -56,9 +56,15 @@ def test_bad_settings(setting, message):
         SystemConfig.for_kind("handheld").with_settings([setting])
 
 
-def test_unknown_kind():
+def test_unknown_kind_and_unknown_key_in_a_file():
     with pytest.raises(ConfigurationError, match="known: handheld, driving"):
         SystemConfig.for_kind("flying")
+    tree = SystemConfig().to_json()
+    tree["map"]["colour"] = 1
+    with pytest.raises(ConfigurationError, match=r"map\.colour"):
+        SystemConfig.from_json(tree)
+    with pytest.raises(ConfigurationError, match=r".motion. is a section"):
+        SystemConfig.from_json({"models": {"motion": None}})
 
 
 def test_a_whole_number_in_place_of_a_fraction_is_the_same_setting():
