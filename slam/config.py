@@ -102,7 +102,8 @@ class SystemConfig:
         Raises:
             ConfigurationError: not of that form, an unknown key, a value of the wrong type or out of range.
         """
-        return with_changes(self, settings)
+        changed: SystemConfig = with_changes(self, settings)
+        return changed
 
 
 #: What the system itself gives to front ends and back ends that it makes.

@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, is_dataclass, replace
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from slam.bounds import MOST
 from slam.errors import ConfigurationError
 from slam.naming import suggestion, unknown
-
-_C = TypeVar("_C")
 
 _FREE = ("frontend", "backend")  # their options are checked by the front end or back end itself
 
@@ -29,8 +27,8 @@ SETTABLE: dict[str, tuple[str, ...]] = {
 }
 
 
-def with_changes(config: _C, settings: Sequence[str] | Mapping[str, Any]) -> _C:
-    """A configuration with other values of some settings, converted and checked by its classes.
+def with_changes(config: Any, settings: Sequence[str] | Mapping[str, Any]) -> Any:
+    """A configuration, a tree of dataclasses, with other values of some settings, converted and checked by its classes.
 
     Settings are texts such as ``"map.max_landmarks=300"``, whose values are JSON or plain words; or values by key, or
     by section and key.
@@ -62,11 +60,11 @@ def with_changes(config: _C, settings: Sequence[str] | Mapping[str, Any]) -> _C:
     return _replaced(config, changes)
 
 
-def _replaced(part: _C, changes: Mapping[str, Any], where: str = "") -> _C:
+def _replaced(part: Any, changes: Mapping[str, Any], where: str = "") -> Any:
     """A dataclass of settings, and those in it, with other values; `where` is its place in the whole."""
     values, hints = dict(changes), get_type_hints(type(part))
     for name, value in changes.items():
-        before: Any = getattr(part, name)
+        before = getattr(part, name)
         if is_dataclass(before):
             values[name] = _replaced(before, value, f"{where}{name}.")
         else:
