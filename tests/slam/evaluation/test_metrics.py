@@ -12,26 +12,23 @@ from evo.core.trajectory import PoseTrajectory3D
 from slam.evaluation.metrics import PathErrors, absolute_errors, associate, relative_errors, segment_errors
 from slam.geometry.se3 import exp, inverse
 from slam.geometry.trajectory import Trajectory, alignment
+from tests.slam.numeric import chained
 
 
 def wander(count: int, seed: int, step: float = 0.5, turn: float = 0.05) -> Trajectory:
     """A path like a vehicle's: forward along z, turning."""
     rng = np.random.default_rng(seed)
-    poses = [np.eye(4)]
-    for _ in range(count - 1):
-        xi = rng.normal(0, [turn, turn, turn, 0.05, 0.05, 0.05]) + np.array([0, 0, 0, 0, 0, step])
-        poses.append(poses[-1] @ exp(xi))
-    return Trajectory(0.1 * np.arange(count), np.array(poses))
+    xi = rng.normal(0, [turn, turn, turn, 0.05, 0.05, 0.05], (count - 1, 6)) + np.array([0, 0, 0, 0, 0, step])
+    return Trajectory(0.1 * np.arange(count), chained(exp(xi)))
 
 
 def disturb(truth: Trajectory, seed: int, drift: float = 0.01, gauge: bool = True) -> Trajectory:
     """An estimate that drifts, in a world frame of its own."""
     rng = np.random.default_rng(seed)
-    poses = [truth.poses[0]]
-    for a, c in pairwise(truth.poses):
-        poses.append(poses[-1] @ inverse(a) @ c @ exp(rng.normal(0, drift, 6)))
+    motions = inverse(truth.poses[:-1]) @ truth.poses[1:]
+    poses = chained(motions @ exp(rng.normal(0, drift, (len(motions), 6))))
     T = exp(rng.normal(size=6) * (1, 1, 1, 10, 10, 10)) if gauge else np.eye(4)
-    return Trajectory(truth.stamps, T @ np.array(poses))
+    return Trajectory(truth.stamps, T @ poses)
 
 
 def to_evo(trajectory: Trajectory) -> PoseTrajectory3D:

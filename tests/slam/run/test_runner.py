@@ -21,7 +21,6 @@ from slam.errors import SequenceError, SlamError
 from slam.geometry.trajectory import Trajectory
 from slam.run import schema
 from slam.run.options import RunOptions
-from slam.run.outputs import FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS
 from slam.run.recording import load_recording
 from slam.run.run_data import RunData
 from slam.run.runner import run
@@ -68,7 +67,6 @@ def test_a_run_leaves_its_files(tmp_path):
     online = Trajectory.read_tum(tmp_path / "trajectory.txt")
     assert len(online) == len(Trajectory.read_tum(tmp_path / "trajectory_final.txt")) == 12
     rows, landmarks = rows_of(tmp_path / "frames.csv"), rows_of(tmp_path / "landmarks.csv")
-    assert (tuple(rows[0]), tuple(landmarks[0])) == (FRAME_COLUMNS, LANDMARK_COLUMNS)
     assert [r["status"] for r in rows] == ["started"] + ["tracked"] * 11
     assert [int(r["frame"]) for r in rows] == list(range(12))
     P = {name: float(rows[-1][name]) for name in ("c00", "c11", "c22", "c33", "c44", "c55")}
@@ -77,7 +75,6 @@ def test_a_run_leaves_its_files(tmp_path):
     assert sum(sd[axis] ** 2 for axis in "xyz") == pytest.approx(P["c33"] + P["c44"] + P["c55"], rel=1e-6)
     assert len(landmarks) == summary["landmarks"] == int(rows[-1]["map_size"])
     assert all(float(r["cxx"]) > 0 for r in landmarks)
-    assert (tmp_path / "objects.csv").read_text().strip() == ",".join(OBJECT_COLUMNS)
     assert json.loads((tmp_path / "summary.json").read_text()) == json.loads(json.dumps(summary))
     assert summary["ended"] == "completed"
     assert summary["accuracy"]["online"]["ATE RMSE [m]"] < 0.01
