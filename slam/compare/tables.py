@@ -15,7 +15,7 @@ import numpy as np
 
 from slam.compare.plan import Plan
 from slam.compare.statistics import Difference, difference, mean_of, reach
-from slam.compare.sweep import Run
+from slam.compare.trial import Run
 from slam.files import read_object, write_text
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import pair

@@ -192,7 +192,7 @@ class Procedure1Detector(ObjectDetector):
         known, rows = found.tracks, free[found.features]
         local = self._rig.triangulate(features.uv_left[rows], features.uv_right[rows])
         points = transform(estimate.T_world_left, local)
-        three, _ = detect(features, (known, rows), points, d)
+        three = detect(features, (known, rows), points, d)[0]
         moved = np.sort(tracks.ids[(tracks.ids >= 0) & isin(tracks.row, rows)])
         labels = MotionLabels(np.sort(rows), np.zeros(0, np.intp), moved)
         if not len(three):

@@ -19,7 +19,7 @@ from slam.compare.plan import CLOSED_LOOP, REPLAY, Plan
 from slam.compare.report import write_report
 from slam.compare.sweep import RUNS, SWEEP, check, sweep
 from slam.compare.tables import groups, write_tables
-from slam.compare.trial import keep_result, run_trial
+from slam.compare.trial import Run, run_trial
 from slam.errors import SlamError
 from slam.run.results import COMPARED
 
@@ -107,7 +107,7 @@ def test_what_is_done_is_not_done_again_and_what_is_not_is(done, again):
 
 def test_a_failed_run_is_counted_never_dropped(again):
     trial = next(t for t in PLAN.trials_of(CLOSED_LOOP) if t.backend == "smoother")
-    keep_result(trial, again / RUNS / trial.folder, ValueError("no\nway"))
+    Run.failed(trial, again / RUNS / trial.folder, ValueError("no\nway")).keep()
     runs = swept(again, 1)
     group = groups(PLAN, runs)[0]
     assert (group.failures("ekf"), group.failures("smoother")) == (0, 1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from slam.compare.plan import Plan, Trial
-from slam.compare.sweep import Run
 from slam.compare.tables import groups, honesty
+from slam.compare.trial import Run
 from slam.run.results import errors_of_truth, facts, figures, rows, verdict, verdict_of_run
 
 TEN, ONE, START, HUNDRED = "ratio_10m", "ratio_1m", "ratio_start", "ratio_100m"
