@@ -26,7 +26,7 @@ from slam.run.run_data import RunData
 from slam.run.runner import run
 from slam.run.summary import RunRecord
 from slam.sequences import open_sequence
-from tests.failing_runs import FRAMES, Features, Scripted, require_whole
+from tests.failing_runs import FRAMES, Features, Scripted
 
 WORLD = "synthetic:aisle?frames=12"
 WITH_TRUTH = set(schema.FILES) - {"summary.png"}  # that one is the command's
@@ -161,9 +161,9 @@ def test_a_stopped_run_keeps_its_frames(tmp_path, kill, ignored):
     _, errors = process.communicate(timeout=300)
     assert process.returncode == (0 if ignored else -9 if kill is signal.SIGKILL else 128 + kill), errors
     assert len(Trajectory.read_tum(path)) >= 5
-    for left in out.glob("*.part"):  # of a kill while a last file was written: beside its place, not in it
-        left.unlink()
-    require_whole(tmp_path, out)
+    if (final := out / "trajectory_final.txt").exists():  # what a kill leaves in part is beside its place
+        assert len(Trajectory.read_tum(final)) >= 5
+    assert None not in rows_of(out / "frames.csv")[-1].values() and json.loads((out / "config.json").read_text())
     if kill is not signal.SIGKILL and not ignored:
         assert f"stopped by {kill.name}; frames done so far are kept: `slam plot" in errors
         assert json.loads((out / "summary.json").read_text())["ended"] == "ended by the user"
