@@ -23,6 +23,19 @@ GAIN = 49.0
 FOCAL_WARNING = 16.0
 
 
+def refuted(covariance: Array, evidence: Evidence, change: Array) -> bool:
+    """Whether the images are far less likely where the calibration is wrong by this `change` (n,); see `conflict`."""
+    pull, held = _of_calibration(covariance, evidence)
+    return bool(change @ held @ change - 2 * pull @ change > GAIN)
+
+
+def _of_calibration(covariance: Array, evidence: Evidence) -> tuple[Array, Array]:
+    """The likelihood of the prior's mean in information form: times the mean (n,), and the information (n, n)."""
+    information = np.linalg.inv(covariance)
+    posterior = np.linalg.inv(information + evidence.S)
+    return information @ (posterior @ evidence.e), information - information @ posterior @ information
+
+
 def conflict(model: RigModel, covariance: Array, evidence: Evidence, which: str = "", focal: float = GAIN) -> str:
     """What is wrong with a calibration, in a line; empty where no cause alone explains the images far better.
 
@@ -30,10 +43,7 @@ def conflict(model: RigModel, covariance: Array, evidence: Evidence, which: str 
     parameters less the prior's mean. A focal length is named from the gain `focal` on, other causes from `GAIN`.
     `which` says which calibration it is: "kept ", or nothing.
     """
-    whose = f"{which}calibration"
-    information = np.linalg.inv(covariance)
-    posterior = np.linalg.inv(information + evidence.S)
-    pull, held = information @ (posterior @ evidence.e), information - information @ posterior @ information
+    whose, (pull, held) = f"{which}calibration", _of_calibration(covariance, evidence)
 
     def freed(*directions: tuple[str, ...]) -> tuple[float, list[float]]:
         """Twice the log-likelihood that is gained with these parameters at any values, and the values."""

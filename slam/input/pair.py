@@ -65,6 +65,11 @@ class PairGeometry:
         """The rows of most matches differ."""
         return self.conclusive and most(self.off_rows, self.matches - self.off_rows)
 
+    @property
+    def rows_agree(self) -> bool:
+        """The rows of most matches agree."""
+        return self.conclusive and most(self.matches - self.off_rows, self.off_rows)
+
 
 class Points(NamedTuple):
     """What is matched of an image."""

@@ -61,8 +61,9 @@ class InputWarnings:
         self._last: Checksum | None = None  # of the frame before
         self._last_copy = ""  # why its right image was a copy
         self._grain_warned = False
-        for unlikely in filter(None, (baseline_doubt(rig.baseline), size_doubt(rig.left, rig.right))):
-            self._warn(unlikely, no_path=True)
+        unit, size = baseline_doubt(rig.baseline), size_doubt(rig.left, rig.right)
+        for unlikely in filter(None, (unit, size)):
+            self._warn(unlikely, no_path=unlikely == unit)  # the images show the other: `slam.calibration`
             self._pair_warned = self._partners_explained = True  # and what follows from it is not
         if not self.lines and (odd := oblong(rig.left, rig.right)):
             self._warn(odd)
@@ -199,7 +200,7 @@ class InputWarnings:
             with suppress(CalibrationError):
                 found = pair_geometry(other, one, two, self._rows) if one and two else PairGeometry(0)
                 share = found.off_rows / max(found.matches, 1)
-                if found.conclusive and not found.rows_differ and share < best and most(own.off_rows, found.off_rows):
+                if found.rows_agree and share < best and most(own.off_rows, found.off_rows):
                     best, said = share, f"{found.off_rows} of {found.matches} {how}"
         cause = f"left and right image are not of one moment ({ONE_MOMENT}), or the two cameras' K and D are exchanged"
         if "inverse" in said:
