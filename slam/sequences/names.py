@@ -161,12 +161,9 @@ def _nanoseconds(text: str, width: int) -> int:
 
 
 def _numbers(sides: Sequence[Sequence[str]]) -> Keys | None:
-    tables = [_columns(names) for names in sides]
-    if not all(tables):
+    told = [[c for c in _columns(names) if len(set(c)) == len(c) and max(c) <= MOST_NANOSECONDS] for names in sides]
+    if not all(told):
         return None
-    told = [[c for c in table if len(set(c)) == len(c) and max(c) <= MOST_NANOSECONDS] for table in tables]
-    if not all(told):  # only several numbers together tell the names apart
-        return _ranks([list(zip(*table)) for table in tables])
     best, chosen = (-1, 0), [columns[-1] for columns in told]
     for column in told[0]:
         others = [max(columns, key=lambda c, column=column: len(set(c) & set(column))) for columns in told[1:]]  # type: ignore[misc]
@@ -200,15 +197,6 @@ def _columns(names: Sequence[str]) -> list[tuple[int, ...]]:
     rows = [[int(digits) for digits in _NUMBER.findall(stem(name))] for name in names]
     columns = list(zip(*rows)) if len({len(row) for row in rows}) == 1 else []
     return columns if len(names) == 1 else [c for c in columns if len(set(c)) > 1]
-
-
-def _ranks(rows: Sequence[Sequence[tuple[int, ...]]]) -> Keys | None:
-    """Places of names in the order of all their numbers."""
-    if any(len(set(own)) < len(own) for own in rows) or not set(rows[0]).intersection(*rows[1:]):
-        return None
-    rank = {row: number for number, row in enumerate(sorted(set().union(*rows)))}
-    guess = "no single number in the names tells the images apart; frames are counted in the order of all of them"
-    return Keys([np.array([rank[row] for row in own], np.int64) for own in rows], False, guess)
 
 
 def _steps(numbers: Sequence[int]) -> list[int]:
