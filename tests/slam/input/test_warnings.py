@@ -282,7 +282,7 @@ def test_swapped_cameras_of_an_unrectified_rig():
     views = [points_of(image) for image in seen_by_both(rig.left, rig.right, rig.R)(FRAME.left, FRAME.right)]
     rig = slam.StereoRig(rig.left, rig.right, rig.R, RIG.b)
     good, bad = pair_geometry(rig, *views, 1.5), pair_geometry(rig, *views[::-1], 1.5)
-    assert good.conclusive and not good.swapped and not good.rows_differ
+    assert good.conclusive and not good.swapped and not good.mostly(good.off_rows)
     assert bad.swapped
 
 
