@@ -9,8 +9,8 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 
 _LAG, _SIGMAS = 0.1, 5.0  # guard: lag of the right images [frames] that counts, and in standard deviations
-_LEAST = 15  # guard: frames of which it is taken
-#: guard: Lag of the last frames alone, of so many, as where an image is missing: a whole frame, of which rows that are
+_LEAST, _MOST = 15, 64  # guard: blocks of frames of which a lag is taken; cost: that are kept apart
+#: guard: Lag in the last frames alone, of so many, as where an image is missing: a whole frame, of which rows that are
 #: matched show .24 to .37. Over the recordings at hand it is .05 at most.
 _SUDDEN, _RECENT = 0.2, 8
 _STILL = 0.1  # guard: flow [px], root mean square, of a camera that hardly moves: rows are the same in all its frames
@@ -26,18 +26,19 @@ class MomentWatch:
 
     It is the regression of vertical disparities on the flow along columns from the frame before; how early they are,
     on that from the frame after. What errors of the calibration explain, which are the same in all frames, is taken
-    out of both first: a camera that drives straight on moves rows in one way, too. The lag is that of all frames, or
-    the largest of a few successive ones. `rig` is the rectified pair.
+    out of both first: a camera that drives straight on moves rows in one way, too. It is taken of all frames, and of
+    the last ones as they come. Sums are kept of blocks of frames, which are merged two by two when there are too many.
+    `rig` is the rectified pair.
     """
 
     def __init__(self, rig: StereoRig) -> None:
         self._rig = rig
         self._before: tuple[Array, Array] | None = None  # pose and features of the last frame, if that was measured
-        # Late and early: sums of products (2, 7, 7) [px²], see `_products`; of each frame (N, 2, 2) what is left of
-        # that of vertical disparities and flow, and of the flow's square.
-        self._whole, self._recent = np.zeros((2, 7, 7)), np.zeros((0, 2, 2))
-        self._frames, self._sums, self._squares = 0, np.zeros((2, 2)), np.zeros((2, 2, 2))  # over all frames
-        self._sudden = np.zeros(2)  # the largest lags of successive frames
+        self._blocks: list[Array] = []  # sums of products (2, 7, 7) [px²], late and early, see `_products`
+        self._length, self._in_last = 1, 1  # frames of a block, and of the last one
+        self._whole = np.zeros((2, 7, 7))  # their sum
+        self._recent: list[Array] = []  # the same of the last frames
+        self._sudden = np.zeros(2)  # largest lag of successive frames (2,), late and early
 
     def add(self, features: StereoFeatures, T_world_left: Array, measured: bool) -> None:
         """Take in a frame: features in rectified pixels, not corrected, and the pose (4, 4), if it was `measured`."""
@@ -48,26 +49,30 @@ class MomentWatch:
         if before is None:
             return
         step = inverse(before[0]) @ T_world_left
-        products = np.stack([self._products(self._before[1], step), self._products(before[1], inverse(step))])
-        if (products[:, 1, 1] < _STILL**2 * products[:, 2, 2]).any():
+        sums = np.stack([self._products(self._before[1], step), self._products(before[1], inverse(step))])
+        if (sums[:, 1, 1] <= _STILL**2 * sums[:, 2, 2]).any():  # also without features
             return
-        self._whole += products
-        fields = self._whole[:, 2:, 2:] + 1e-9 * self._whole[:, 2, 2, None, None] * np.eye(5)  # numerics: invertible
-        less = np.concatenate([np.stack([np.eye(2)] * 2), -np.linalg.solve(fields, self._whole[:, 2:, :2])], axis=1)
-        left = (np.swapaxes(less, 1, 2) @ products @ less)[..., 1]
-        self._frames, self._sums = self._frames + 1, self._sums + left
-        self._squares = self._squares + left[:, :, None] * left[:, None]
-        self._recent = np.concatenate([self._recent[1 - _RECENT :], left[None]])
-        if len(self._recent) == _RECENT and self._frames % 2:  # cost: every second frame
-            squares = np.einsum("nij,nik->ijk", self._recent, self._recent)
-            self._sudden = np.maximum(self._sudden, _lags(self._recent.sum(axis=0), squares, _SUDDEN))
+        self._whole += sums
+        self._recent.append(sums)
+        if len(self._recent) == _RECENT:
+            self._sudden = np.maximum(self._sudden, _lags(np.array(self._recent), self._whole, _SUDDEN))
+            del self._recent[:2]  # cost: every second frame
+        if self._blocks and self._in_last < self._length:
+            self._blocks[-1] = self._blocks[-1] + sums
+            self._in_last += 1
+            return
+        if len(self._blocks) == _MOST:
+            self._blocks = [a + b for a, b in zip(self._blocks[::2], self._blocks[1::2])]
+            self._length *= 2
+        self._blocks.append(sums)
+        self._in_last = 1
 
     @property
     def doubt(self) -> str:
         """What to say where rows differ as they do between images of two moments; empty where they do not."""
         lags = self._sudden
-        if self._frames >= _LEAST:
-            lags = np.maximum(lags, _lags(self._sums, self._squares, _LAG))
+        if len(self._blocks) >= _LEAST:
+            lags = np.maximum(lags, _lags(np.array(self._blocks), self._whole, _LAG))
         word = ("late", "early")[int(np.argmax(lags))] if lags.any() else ""
         return word and (
             "left and right image are not of one moment: rows of their features differ with the motion, as if right "
@@ -96,16 +101,17 @@ class MomentWatch:
         return np.asarray(columns.T @ columns)
 
 
-def _lags(sums: Array, squares: Array, least: float) -> Array:
-    """Lags (2,) [frames], late and early, by sums (2, 2) over frames and squares (2, 2, 2) of `MomentWatch`.
+def _lags(sums: Array, whole: Array, least: float) -> Array:
+    """Lags (2,) [frames], late and early, by sums (N, 2, 7, 7), 0 for none that is certain and more than the `least`.
 
-    0 for one that is not certain, or not more than the `least`.
+    Of the `whole` (2, 7, 7) run's sums is what errors of the calibration explain.
     """
-    total = np.maximum(sums[:, 1], np.finfo(float).tiny)
-    lag = -sums[:, 0] / total
-    line = np.stack([np.ones(2), lag], axis=1)
-    scatter = np.einsum("ij,ijk,ik->i", line, squares, line)  # of the frames about the line
-    sigma = np.sqrt(np.maximum(scatter, 0.0)) / total
+    fields = whole[:, 2:, 2:] + 1e-9 * whole[:, 2, 2, None, None] * np.eye(5)  # numerics: invertible
+    less = np.concatenate([np.stack([np.eye(2)] * 2), -np.linalg.solve(fields, whole[:, 2:, :2])], axis=1)
+    products, squares = np.moveaxis((np.swapaxes(less, 1, 2) @ sums @ less)[..., 1], 2, 0)  # (N, 2) each
+    total = np.maximum(squares.sum(axis=0), np.finfo(float).tiny)
+    lag = -products.sum(axis=0) / total
+    sigma = np.sqrt(np.square(products + lag * squares).sum(axis=0)) / total
     return np.where(lag > np.maximum(least, _SIGMAS * sigma), lag, 0.0)
 
 
