@@ -189,18 +189,18 @@ class InputWarnings:
     def _explained(self, left: Points, right: Points, own: PairGeometry) -> str:
         """What makes rows agree best, where something does: another moment of one image, or the rotation's inverse."""
         rig, before = self._rig, self._before
-        tried: list[tuple[Points | None, Points | None, StereoRig, str]] = []
-        if before is not None:
-            tried.append((_points(before.left, rig), right, rig, "where right images are taken to come a frame late"))
-            tried.append((left, _points(before.right, rig), rig, "where right images are taken to come a frame early"))
+        was = (None, None) if before is None else (_points(before.left, rig), _points(before.right, rig))
+        tried = [
+            (was[0], right, rig, "where right images are taken to come a frame late"),
+            (left, was[1], rig, "where right images are taken to come a frame early"),
+        ]
         if not rig.is_rectified:
             tried.append((left, right, replace(rig, R=rig.R.T), "with the inverse of the calibration's rotation"))
         best, said = 1.0, ""
         for one, two, other, how in tried:
             with suppress(CalibrationError):
                 found = pair_geometry(other, one, two, self._rows) if one and two else PairGeometry(0)
-                share = found.off_rows / max(found.matches, 1)
-                agree = found.mostly(found.matches - found.off_rows)
+                agree, share = found.mostly(found.matches - found.off_rows), found.off_rows / max(found.matches, 1)
                 if agree and share < best and most(own.off_rows, found.off_rows):
                     best, said = share, f"{found.off_rows} of {found.matches} {how}"
         cause = f"left and right image are not of one moment ({ONE_MOMENT}), or the two cameras' K and D are exchanged"

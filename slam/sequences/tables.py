@@ -79,8 +79,8 @@ def read_times(path: Path, faults: FaultLog) -> Times:
         faults.report("times", f"{path}: the first number of each row counts rows; the second one is taken as time")
         times = second
     told = times[np.isfinite(times)]
-    since_1970 = len(told) > 0 and SINCE_1970[0] <= told[0] <= SINCE_1970[1]  # seconds, however far apart
-    if not since_1970 and (step := np.median([0.0, *np.abs(np.diff(told))])) > _SLOWEST:  # as a camera's in that unit
+    absolute = len(told) > 0 and SINCE_1970[0] <= told[0] <= SINCE_1970[1]  # seconds, however far apart
+    if not absolute and (step := np.median([0.0, *np.abs(np.diff(told))])) > _SLOWEST:  # as a camera's in that unit
         unit, size = min(UNITS, key=lambda one: abs(np.log(step / one[1] / _USUAL)))
         faults.report("times", f"{path}: the times are taken as {unit}")
         times = times / size
