@@ -11,6 +11,7 @@ import numpy as np
 
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import FOCALS, Evidence, along
+from slam.geometry.camera import off_middle
 from slam.geometry.se3 import Array
 
 #: guard: Least gain of twice the log-likelihood. With unlimited data it is the square of the error in standard
@@ -23,8 +24,15 @@ GAIN = 49.0
 FOCAL_WARNING = 16.0
 
 
-def refuted(covariance: Array, evidence: Evidence, change: Array) -> bool:
-    """Whether the images are far less likely where the calibration is wrong by this `change` (n,); see `conflict`."""
+def middle_refuted(model: RigModel, mean: Array, covariance: Array, evidence: Evidence) -> bool:
+    """Whether the images are far less likely if the principal points are in their middle; see `conflict`.
+
+    `mean` (n,) is the prior's.
+    """
+    change = -mean
+    for side, camera in (("left", model.rig.left), ("right", model.rig.right)):
+        x, y = off_middle(camera) * (camera.width - 1, camera.height - 1) / 2 / (camera.fu, camera.fv)
+        change = change + x * along(model, f"{side}_cx") + y * along(model, f"{side}_cy")
     pull, held = _of_calibration(covariance, evidence)
     return bool(change @ held @ change - 2 * pull @ change > GAIN)
 

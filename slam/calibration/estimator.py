@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from slam.calibration.config import SelfCalibrationConfig
-from slam.calibration.conflict import FOCAL_WARNING, GAIN, conflict, refuted
+from slam.calibration.conflict import FOCAL_WARNING, GAIN, conflict, middle_refuted
 from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.calibration.pairs import View, match, noise_variances, pair_evidence, pair_of, parallax
 from slam.calibration.posterior import (
@@ -40,7 +40,7 @@ from slam.calibration.saved import SavedCalibration, joint_calibration
 from slam.data import CommonError, Estimate, StereoFeatures
 from slam.errors import CalibrationError, ConfigurationError
 from slam.geometry.arrays import changed
-from slam.geometry.camera import off_middle, size_doubt
+from slam.geometry.camera import size_doubt
 from slam.geometry.rig import StereoRig, rig_difference, rig_numbers
 from slam.geometry.se3 import Array, adjoint
 from slam.interfaces import Backend, ConsideringBackend, RevisingBackend
@@ -129,17 +129,9 @@ class SelfCalibration:
         found = rows if moved is None else rows + moved
         found = found._replace(e=found.e - found.S @ self._prior.mean)
         prior = self._prior.covariances[-1]
-        if unlikely and not refuted(prior, found, self._to_middle() - self._prior.mean):
+        if unlikely and not middle_refuted(self.model, self._prior.mean, prior, found):
             return unlikely
         return conflict(self.model, prior, found, "kept " if self._kept else "", focal)
-
-    def _to_middle(self) -> Array:
-        """The parameters (n,) by which principal points are in the middle of their images."""
-        change = np.zeros(len(self.model.names))
-        for side, camera in (("left", self.rig.left), ("right", self.rig.right)):
-            x, y = off_middle(camera) * (camera.width - 1, camera.height - 1) / 2 / (camera.fu, camera.fv)
-            change += x * along(self.model, f"{side}_cx") + y * along(self.model, f"{side}_cy")
-        return change
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Apply the present posterior to features from now on; returns the change, or None.
