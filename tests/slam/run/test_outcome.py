@@ -106,14 +106,18 @@ def test_a_vehicle_that_goes_sideways_is_doubted():
     assert motion_doubt(along((0.3, 0, 0.05)), MotionModel()) == ""
 
 
-@pytest.mark.parametrize("closed", [[], [15]])
-def test_a_camera_that_jumps_is_doubted_but_not_where_a_loop_moves_the_path(closed):
+@pytest.mark.parametrize(
+    ("closed", "lost", "words"), [([], [], "changes by 20 m/s"), ([], [15, 16], "changes by 6.7 m/s"), ([15], [], "")]
+)
+def test_a_camera_that_jumps_is_doubted_but_not_where_a_loop_moves_the_path(closed, lost, words):
     run = along((0, 0, 0.4), closed=closed)
+    for k in lost:  # until landmarks are believed again
+        run.measured[k] = False
     assert motion_doubt(run, MotionModel()) == ""
     for k in range(15, 30):  # as by images that are missing
         run.poses[k] = exp(np.array([0, 0, 0, 0, 0, 2.0])) @ run.poses[k]
     said = motion_doubt(run, MotionModel())
-    assert said.startswith("the velocity changes by 20 m/s from one frame to the next") if not closed else said == ""
+    assert words in said and bool(words) == bool(said)
 
 
 @pytest.mark.parametrize(("doubt", "status"), [("", 0), ("rows do not agree", 1)])
