@@ -63,7 +63,7 @@ def test_unknown_kind_and_unknown_key_in_a_file():
     tree["map"]["colour"] = 1
     with pytest.raises(ConfigurationError, match=r"map\.colour"):
         SystemConfig.from_json(tree)
-    with pytest.raises(ConfigurationError, match=r"setting models\.motion must be an object"):
+    with pytest.raises(ConfigurationError, match=r".motion. is a section"):
         SystemConfig.from_json({"models": {"motion": None}})
 
 

@@ -14,11 +14,6 @@ vectors = arrays(float, 3, elements=st.floats(-3, 3))
 twists = arrays(float, 6, elements=st.floats(-1.7, 1.7))
 
 
-@given(vectors)
-def test_so3_exp_is_the_matrix_exponential(w):
-    np.testing.assert_allclose(se3.so3_exp(w), expm(se3.hat(w)), atol=1e-12)
-
-
 @given(twists)
 def test_se3_exp_is_the_matrix_exponential(xi):
     matrix = np.zeros((4, 4))

@@ -18,6 +18,7 @@ from slam.outputs import Output
 from slam.run.options import RunOptions
 from slam.run.outcome import motion_doubt, outcome, scale_doubt
 from slam.run.summary import RunRecord
+from tests.slam.numeric import chained
 
 OPTIONS = RunOptions("ekf", "surf", SystemConfig())
 RIG = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
@@ -57,9 +58,7 @@ def moving(times_too_short: float, frames: int = 40) -> RunRecord:
     rng = np.random.default_rng(0)
     interval = 0.05
     velocities = np.cumsum(rng.normal(size=(frames, 6)) * np.sqrt(interval), axis=0)
-    poses = [np.eye(4)]
-    for velocity in velocities[1:]:
-        poses.append(poses[-1] @ exp(velocity * interval))
+    poses = list(chained(exp(velocities[1:] * interval)))
     stamps = (np.arange(frames) * interval / times_too_short).tolist()
     return RunRecord(stamps=stamps, poses=poses, measured=[True] * frames)
 
