@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from backends.smoother import joint
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key
 from backends.smoother.state import SmootherState
 from backends.smoother.tracks import GraphProblem, Stamps, Tracks
@@ -47,7 +48,8 @@ class Solved:
     serials: IdArray  # of landmarks that are variables (V,)
     points: Array  # and where they are (V, 3)
     linearised: Array  # and where they are linearised (V, 3)
-    covariance: Array  # joint covariance of the anchor, or the oldest pose, the last but one, and the last (18, 18)
+    joint: Array  # covariance (18, 18) of the last pose, which is the anchor, see `backends.smoother.joint`
+    drift: Array  # by how much (6, 6) the last pose is less certain than the anchor before it
     spread: Array  # covariances (N, 6, 6) of those that are new
 
 
@@ -156,12 +158,20 @@ class Graph:
             transform(self._to_state, np.array([v.atPoint3(landmark_key(n)) for n in kept]).reshape(-1, 3))
             for v in (values, self._solver.getLinearizationPoint() if kept else values)
         )
-        joint = self._joint([max(oldest, i) for i in (s.anchor, s.number - 1, s.number)])
-        spread = np.array([*(self._joint([i]) for i in new[:-1]), joint[-6:, -6:]])
-        if not (np.isfinite(poses).all() and np.isfinite(joint).all() and (np.diag(joint) > 0).all()):
+        at = [max(oldest, i) for i in (s.anchor, s.number - 1, s.number)]
+        before, T0, T = poses[np.array(at) - oldest]
+        P = self._relative(at)
+        spread = np.array([*(self._joint([i]) for i in new[:-1]), (P + self._rigid(at))[12:, 12:]])
+        shared = joint.anchored(P, np.zeros((6, 6)), np.array([T0, T]))
+        shared[:6, :6] = spread[-1]
+        # the covariance of the motion between them, were that independent of the anchor's error; of many successive
+        # motions these add up to what the path drifts by
+        A = adjoint(inverse(T) @ before)
+        drift = joint.root(P[12:, 12:] - A @ P[:6, :6] @ A.T)
+        if not (np.isfinite(poses).all() and np.isfinite(shared).all() and (np.diag(P) > 0).all()):
             raise SolverError("gtsam: the solution is not finite, or a variance not positive")
         self.number = s.number
-        return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, joint, spread)
+        return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, shared, drift @ drift.T, spread)
 
     def joint_covariance(self, s: SmootherState, first: int, last: int) -> tuple[int, Array]:
         """Number of the first pose, and the joint covariance (6 K, 6 K) of the poses from there to the `last`.
@@ -200,14 +210,23 @@ class Graph:
         return self.number == s.solved >= max(s.begun, s.first) and self._kind == _kind(s)
 
     def _joint(self, numbers: list[int]) -> Array:
+        """Joint covariance (6 K, 6 K) in the world of poses."""
+        return self._relative(numbers) + self._rigid(numbers)
+
+    def _rigid(self, numbers: list[int]) -> Array:
+        """What is known of the first pose in the world as a joint covariance (6 K, 6 K) of poses."""
+        A = adjoint(inverse(np.array([self._poses[i] for i in numbers])) @ self._first).reshape(-1, 6)
+        return np.asarray(A @ self._base @ A.T)
+
+    def _relative(self, numbers: list[int]) -> Array:
+        """Joint covariance (6 K, 6 K) of poses, besides what is known of the first one in the world."""
         each, at = np.unique(numbers, return_inverse=True)
         keys = [pose_key(i) for i in each.tolist()]
         with solving():
             isam = self._solver.getISAM2()
             P = isam.marginalCovariance(keys[0]) if len(keys) == 1 else isam.jointMarginalCovariance(keys).fullMatrix()
         again = (6 * at[:, None] + np.arange(6)).ravel()
-        A = adjoint(inverse(np.array([self._poses[i] for i in numbers])) @ self._first).reshape(-1, 6)
-        P = P[again[:, None], again] + A @ self._base @ A.T
+        P = P[again[:, None], again]
         return np.asarray(0.5 * (P + P.T))
 
 
@@ -226,8 +245,8 @@ def held(s: SmootherState, number: int) -> tuple[Array, Array]:
     if s.anchored:
         return P, np.zeros((6, 6))
     prior = np.diag(np.minimum(np.diag(P), _FIRM))
-    values, vectors = np.linalg.eigh(P - prior)
-    return prior, (vectors * values.clip(min=0)) @ vectors.T
+    base = joint.root(P - prior)
+    return prior, base @ base.T
 
 
 def by_pose(T: Array, position: Array) -> Array:

@@ -32,10 +32,11 @@ def corrected(s: SmootherState, correct: Callable[[Array], Array]) -> SmootherSt
 def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     """The last poses after a correction: the newest one stays where it is, the others and the landmarks move."""
     first = s.oldest(steps.config.lag, s.number)
-    now, spread, start = s.poses[s.of(first) :], s.spread, s.start
+    now, spread, joint, start = s.poses[s.of(first) :], s.spread, s.joint, s.start
     with suppress(SolverError):  # then the next update tries again
         solved = graph.rebuilt(s, _AGAIN)
         now, spread = solved.poses, np.concatenate([spread[:-1], solved.spread[-1:]])
+        joint = solved.joint if s.anchor == s.number else joint
         if not s.anchored:
             M = s.poses[-1] @ inverse(now[-1])
             graph.displaced(M)
@@ -49,4 +50,4 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     position = np.where(unseen[:, None], transform(D, marks.position), marks.position)
     marks = replace(marks, position=position, mean=np.where(unseen[:, None], position, marks.mean))
     marks = marks.refined(steps.stereo, steps.models.pixel_sigma, s.first, moved)
-    return replace(s, poses=moved, landmarks=marks, spread=spread, start=start, solved=graph.number)
+    return replace(s, poses=moved, landmarks=marks, spread=spread, joint=joint, start=start, solved=graph.number)

@@ -48,8 +48,8 @@ class Known:
 class SmootherState:
     """The poses of all frames that are kept, by number, and the landmarks.
 
-    A pose from which nothing was measured follows from the motion model alone. The last two poses' covariances, and
-    those of landmarks, are relative to the anchor.
+    A pose from which nothing was measured follows from the motion model alone. Covariances of landmarks are relative to
+    the anchor.
     """
 
     first: int  # number of the first pose that is kept
@@ -60,8 +60,7 @@ class SmootherState:
     ages: IndexArray  # how many poses up to each (K,) gave the graph anything: the lag is counted in these
     sights: tuple[Sight, ...]  # what the graph is given of each
     spread: Array  # covariance in the world of each when it was the newest that was solved for (K, 6, 6)
-    pair: Array  # joint covariance (12, 12) of the errors of the last two poses relative to the anchor
-    shared: Array  # covariance (6, 12) of the anchor's own error in the world with these
+    joint: Array  # covariance (18, 18) of the anchor and the last two poses, see `backends.smoother.joint`
     by_rig: Array  # derivatives of the last two poses' errors by errors of the rig (12, m)
     # of the pose with which the problem begins, before anything was measured from it: covariance (6, 6), where it was
     # believed to be (4, 4), and the covariance of its attitude about the world's axes (3, 3) [rad²]
@@ -82,8 +81,7 @@ class SmootherState:
         """Before the first prediction; `by_rig` (6, m) is of the first pose."""
         return cls(
             0, 0, np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0, bool), np.zeros(0, np.intp), (), np.zeros((0, 6, 6)),
-            np.zeros((12, 12)), np.zeros((6, 12)), np.tile(by_rig, (2, 1)),
-            landmarks=SmootherLandmarks.none(by_rig.shape[1]),
+            np.zeros((18, 18)), np.tile(by_rig, (2, 1)), landmarks=SmootherLandmarks.none(by_rig.shape[1]),
         )  # fmt: skip
 
     @property
@@ -104,7 +102,14 @@ class SmootherState:
     @property
     def own(self) -> Array:
         """Covariance (6, 6) of the newest pose's error relative to the anchor."""
-        return self.pair[6:, 6:]
+        return self.joint[12:, 12:]
+
+    @property
+    def gain(self) -> Array:
+        """By how much (6, 6) the last but one pose's error relative to the anchor follows the newest one's."""
+        if self.number == self.begun:
+            return np.zeros((6, 6))
+        return np.asarray(np.linalg.solve(self.own, self.joint[12:, 6:12]).T)
 
     def intervals(self, number: int) -> tuple[float, float | None]:
         """Time [s] from the pose before to a pose, and from the one before that; None where there is none."""
