@@ -87,7 +87,7 @@ class BatchBackend:
         s = self._smoother.state
         if not s.started:
             return self._smoother.trajectory()
-        found, solved = self._smoother.path.trajectory(), self._solved().poses
+        found, solved = self._smoother.trajectory(), self._solved().poses
         found.poses[-len(solved) :] = solved
         return found
 

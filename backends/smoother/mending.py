@@ -45,9 +45,11 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
             start = M @ start
     D = now[0] @ inverse(s.poses[s.of(first)])
     moved = np.concatenate([D @ s.poses[: s.of(first)], now])
-    marks = s.landmarks
+    marks, left = s.landmarks, D @ s.left_poses
     unseen = ~marks.world & ~(marks.pose >= first).any(axis=1)
     position = np.where(unseen[:, None], transform(D, marks.position), marks.position)
     marks = replace(marks, position=position, mean=np.where(unseen[:, None], position, marks.mean))
     marks = marks.refined(steps.stereo, steps.models.pixel_sigma, s.first, moved)
-    return replace(s, poses=moved, landmarks=marks, spread=spread, joint=joint, start=start, solved=graph.number)
+    return replace(
+        s, poses=moved, left_poses=left, landmarks=marks, spread=spread, joint=joint, start=start, solved=graph.number
+    )  # fmt: skip

@@ -62,16 +62,17 @@ class SmootherState:
     spread: Array  # covariance in the world of each when it was the newest that was solved for (K, 6, 6)
     joint: Array  # covariance (18, 18) of the anchor and the last two poses, see `backends.smoother.joint`
     by_rig: Array  # derivatives of the last two poses' errors by errors of the rig (12, m)
-    # of the pose with which the problem begins, before anything was measured from it: covariance (6, 6), where it was
-    # believed to be (4, 4), and the covariance of its attitude about the world's axes (3, 3) [rad²]
+    # of the pose with which the problem begins, before anything was measured from it: covariance (6, 6), and where it
+    # was believed to be (4, 4)
     prior: Array = field(default_factory=lambda: np.zeros((6, 6)))
     start: Array = field(default_factory=lambda: np.eye(4))
-    turned: Array = field(default_factory=lambda: np.zeros((3, 3)))
     anchor: int = 0  # number of the last pose that gave the graph anything
     solved: int = -1  # number of the newest pose that the graph solved for; −1 for none
     landmarks: SmootherLandmarks = field(default_factory=SmootherLandmarks.none)
     serials: int = 0  # number of landmarks so far
     known: Mapping[int, Known] = field(default_factory=dict)  # by serial number
+    left_stamps: Array = field(default_factory=lambda: np.zeros(0))  # times of poses that are kept no more (N,) [s]
+    left_poses: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # and these, which are final
     measured: bool = False  # whether the newest pose may not be updated any more
     revisions: int = 0  # how often the measurements were revised
     contradicted: int = 0  # updates in succession in which most observations agreed on another pose than expected
@@ -140,6 +141,8 @@ class SmootherState:
         return replace(
             self, first=self.first + gone, poses=self.poses[gone:], stamps=self.stamps[gone:], rests=self.rests[gone:],
             ages=self.ages[gone:], sights=self.sights[gone:], spread=self.spread[gone:],
+            left_stamps=np.append(self.left_stamps, self.stamps[:gone]),
+            left_poses=np.concatenate([self.left_poses, self.poses[:gone]]),
             landmarks=self.landmarks.folded(self.first + gone, oldest),
             known={k: one for k, one in self.known.items() if not 0 <= one.pose < self.first + gone},
         )  # fmt: skip

@@ -83,8 +83,8 @@ class Steps(RectifiedMeasurement):
         try:
             one = self._problem(s, rows, z)
             at, start = s.of(s.anchor), one.predicted if guess is None else guess
-            R = s.poses[at, :3, :3]
-            lost = len(s.sights[at]) >= MIN_CONSENSUS and unknown_turn(R @ s.spread[at, :3, :3] @ R.T - s.turned)
+            turned = _attitude(s.poses[at], s.spread[at]) - _attitude(s.start, s.prior)  # since the problem began
+            lost = len(s.sights[at]) >= MIN_CONSENSUS and unknown_turn(turned)
             found = agreement(
                 one, start, lambda: landmarks_pose(self, one.points, z, one.predicted, s.number), s.contradicted, lost
             )
@@ -231,6 +231,11 @@ class Steps(RectifiedMeasurement):
         return C
 
 
+def _attitude(T: Array, P: Array) -> Array:
+    """Covariance (3, 3) about the world's axes of the attitude of a pose T (4, 4) with a covariance P (6, 6) [rad²]."""
+    return np.asarray(T[:3, :3] @ P[:3, :3] @ T[:3, :3].T)
+
+
 def _begun(s: SmootherState, T: Array, P: Array) -> SmootherState:
     """With the newest pose, at T (4, 4) with a covariance P (6, 6), as the one with which the problem begins (anew).
 
@@ -238,7 +243,7 @@ def _begun(s: SmootherState, T: Array, P: Array) -> SmootherState:
     """
     return replace(
         s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread[:-1], P[None]]),
-        joint=joint.alone(P), prior=P, start=T, turned=T[:3, :3] @ P[:3, :3] @ T[:3, :3].T,
+        joint=joint.alone(P), prior=P, start=T,
         begun=s.number, anchor=s.number, landmarks=s.landmarks.without_measurements(np.ones(len(s.landmarks), bool)),
         known={serial: one for serial, one in s.known.items() if one.pose < 0},
     )  # fmt: skip
