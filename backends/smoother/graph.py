@@ -6,17 +6,19 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import gtsam
 import numpy as np
 
 from backends.smoother import joint
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key
+from backends.smoother.landmarks import by_pose
 from backends.smoother.state import SmootherState
-from backends.smoother.tracks import GraphProblem, Stamps, Tracks
+from backends.smoother.tracks import GraphProblem, Tracks
 from slam.data import IdArray
 from slam.errors import SlamError
-from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array, adjoint, inverse, transform
 
 _ENDLESS = 1e9  # numerics: a lag that no run reaches
 _CAREFUL = 20  # numerics: poses after a failure whose factors are made so that they do not throw
@@ -43,14 +45,19 @@ def solving() -> Iterator[None]:
 class Solved:
     """The last poses as the graph has them."""
 
-    first: int  # number of the first one
+    oldest: int  # number of the first one
     poses: Array  # (L, 4, 4)
-    serials: IdArray  # of landmarks that are variables (V,)
-    points: Array  # and where they are (V, 3)
+    serials: IdArray  # of landmarks that are variables (V,),
+    points: Array  # where they are (V, 3),
     linearised: Array  # and where they are linearised (V, 3)
     joint: Array  # covariance (18, 18) of the last pose, which is the anchor, see `backends.smoother.joint`
     drift: Array  # by how much (6, 6) the last pose is less certain than the anchor before it
     spread: Array  # covariances (N, 6, 6) of those that are new
+
+    def displaced(self, M: Array) -> Solved:
+        """After a displacement M (4, 4) in the world."""
+        points, linearised = transform(M, self.points), transform(M, self.linearised)
+        return replace(self, poses=M @ self.poses, points=points, linearised=linearised)
 
 
 class Graph:
@@ -85,9 +92,9 @@ class Graph:
         )
         self._tracks = Tracks(self._make, self._lag)
         self.number, self._taken = -1, 0
-        self._base: Array = np.zeros((6, 6))  # what is known of the first pose, besides its prior
+        self._base: Array = np.zeros((6, 6))  # covariance of the first pose in the world, besides its prior
         self._poses: dict[int, Array] = {}
-        self._first = np.eye(4)  # the first pose
+        self._start = np.eye(4)  # the first pose
         self._to_state = np.eye(4)  # takes gtsam's coordinates to the state's
         self._kind = False, 0
 
@@ -110,43 +117,44 @@ class Graph:
             s = replace(s, landmarks=s.landmarks.without_variables(s.number))
         return self.rebuilt(s), why
 
-    def rebuilt(self, s: SmootherState, again: int = 0) -> Solved:
-        """The solution with all anew, linearised `again` so many times more; SolverError where gtsam fails."""
+    def rebuilt(self, s: SmootherState, steps: int = 0) -> Solved:
+        """The solution with all anew, after so many `steps` more than usual; SolverError where gtsam fails."""
         self.restart()
         oldest, self._careful = s.oldest(self._lag, s.number), max(self._careful, s.number + 1)
-        self._kind, self._first = _kind(s), s.poses[s.of(oldest)]
-        prior, self._base = held(s, oldest)
-        begin = GraphProblem()
-        begin.factors.add(self._make.prior(oldest, s.start if oldest == s.begun else self._first, prior))
-        return self._update(s, range(oldest, s.number + 1), begin, again)
+        self._kind, self._start = _kind(s), s.poses[s.of(oldest)]
+        prior, self._base = first_prior(s, oldest)
+        problem = GraphProblem()
+        problem.factors.add(self._make.prior(oldest, s.start if oldest == s.begun else self._start, prior))
+        return self._update(s, range(oldest, s.number + 1), problem, steps)
 
     def displaced(self, M: Array) -> None:
         """Follow a displacement M (4, 4) of all that the state has in the world: what is in it is relative."""
-        self._to_state, self._first = M @ self._to_state, M @ self._first
+        self._to_state, self._start = M @ self._to_state, M @ self._start
         self._poses = {number: M @ T for number, T in self._poses.items()}
 
-    def _update(self, s: SmootherState, numbers: range, problem: GraphProblem, again: int = 0) -> Solved:
-        """The solution after a problem, and some poses with what was measured from them; solved `again` so often."""
-        oldest, before = s.oldest(self._lag, s.number), numbers.start - 1
-        first = min(oldest, before) if self._poses else oldest  # more than a lag of poses may have seen nothing
+    def _update(self, s: SmootherState, numbers: range, problem: GraphProblem, steps: int = 0) -> Solved:
+        """The solution with what is in a problem, and poses of some numbers with what was measured from them."""
+        oldest = s.oldest(self._lag, s.number)
+        # until this update is done; since the last one more than a lag of poses may have come
+        begin = min(oldest, numbers.start - 1) if self._poses else oldest
         for number in numbers:
-            if number > first:
-                self._tracks.add_rows(problem, s, number - 1, first, self._taken)
-            self._tracks.add_pose(problem, s, number, first)
-            self._tracks.add_rows(problem, s, number, first)
+            if number > begin:
+                self._tracks.add_rows(problem, s, number - 1, begin, self._taken)
+            self._tracks.add_pose(problem, s, number, begin)
+            self._tracks.add_rows(problem, s, number, begin)
             self._taken = len(s.sights[s.of(number)])
         kept = self._tracks.keep(problem, s)
         made = self._tracks.make_smart(problem, s.number < self._careful)
-        # Two steps of Gauss and Newton. gtsam's clock is the newest stamp: in the first step it stands, so nothing
-        # leaves. What leaves fixes where its neighbours stay linearised, and that is to be after the newest pose is
-        # solved for.
-        now: Stamps = dict.fromkeys(problem.values.keys(), float(s.ages[s.of(numbers.start)] - 1))
+        # Two steps of Gauss and Newton. What leaves the lag fixes where its neighbours stay linearised, and that is to
+        # be where they are once the newest pose is solved for. gtsam's clock is the latest time of a variable: in the
+        # first step all that is new has the time of the last update, so that nothing leaves.
+        now: dict[Any, Any] = dict.fromkeys(problem.values.keys(), float(s.ages[s.of(numbers.start)] - 1))
         with solving():
             self._solver.update(problem.factors, problem.values, now, problem.removed)
             slots = self._solver.getISAM2Result().getNewFactorsIndices()
-            for _ in range(again):
+            for _ in range(steps):
                 self._solver.update()
-            self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.stamps)
+            self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.ages)
             values = self._solver.calculateEstimate()
         for track, place in made:
             track.slot = slots[place]
@@ -161,7 +169,7 @@ class Graph:
         at = [max(oldest, i) for i in (s.anchor, s.number - 1, s.number)]
         before, T0, T = poses[np.array(at) - oldest]
         P = self._relative(at)
-        spread = np.array([*(self._joint([i]) for i in new[:-1]), (P + self._rigid(at))[12:, 12:]])
+        spread = np.array([*(self._covariance([i]) for i in new[:-1]), (P + self._rigid(at))[12:, 12:]])
         shared = joint.anchored(P, np.zeros((6, 6)), np.array([T0, T]))
         shared[:6, :6] = spread[-1]
         # the covariance of the motion between them, were that independent of the anchor's error; of many successive
@@ -176,15 +184,15 @@ class Graph:
     def joint_covariance(self, s: SmootherState, first: int, last: int) -> tuple[int, Array]:
         """Number of the first pose, and the joint covariance (6 K, 6 K) of the poses from there to the `last`.
 
-        From `first` on, or the oldest in the graph; of the last pose alone, if the graph is not the state's. Poses that
-        nothing was measured from since follow from the motion model.
+        It begins at `first`, or at the oldest pose in the graph; where the graph is not the state's, at the last one.
+        Poses that are not in the graph yet follow from the motion model.
         """
         if not self._is_of(s):
             return last, s.spread[s.of(last)]
         oldest, solved = s.oldest(self._lag, self.number), self.number
         first = max(oldest, first)
         begin = max(oldest, min(first, solved - 1))  # where the motion goes on, it needs two poses
-        P = self._joint(list(range(begin, min(solved, last) + 1)))
+        P = self._covariance(list(range(begin, min(solved, last) + 1)))
         for number in range(solved + 1, last + 1):
             _, J, noise, _ = s.moved(self._make.models, number)
             J = J[:, -len(P) :]
@@ -201,21 +209,20 @@ class Graph:
         key = landmark_key(serial)
         if not self._is_of(s) or not self._solver.getLinearizationPoint().exists(key):
             return None
-        J = by_pose(self._first, position)
-        R = self._to_state[:3, :3]
+        J, R = by_pose(self._start, position[None])[0], self._to_state[:3, :3]
         return np.asarray(R @ self._solver.getISAM2().marginalCovariance(key) @ R.T + J @ self._base @ J.T)
 
     def _is_of(self, s: SmootherState) -> bool:
         """Whether it is the state's graph, up to poses since the last update; not if that was interrupted."""
         return self.number == s.solved >= max(s.begun, s.first) and self._kind == _kind(s)
 
-    def _joint(self, numbers: list[int]) -> Array:
+    def _covariance(self, numbers: list[int]) -> Array:
         """Joint covariance (6 K, 6 K) in the world of poses."""
         return self._relative(numbers) + self._rigid(numbers)
 
     def _rigid(self, numbers: list[int]) -> Array:
         """What is known of the first pose in the world as a joint covariance (6 K, 6 K) of poses."""
-        A = adjoint(inverse(np.array([self._poses[i] for i in numbers])) @ self._first).reshape(-1, 6)
+        A = adjoint(inverse(np.array([self._poses[i] for i in numbers])) @ self._start).reshape(-1, 6)
         return np.asarray(A @ self._base @ A.T)
 
     def _relative(self, numbers: list[int]) -> Array:
@@ -225,33 +232,28 @@ class Graph:
         with solving():
             isam = self._solver.getISAM2()
             P = isam.marginalCovariance(keys[0]) if len(keys) == 1 else isam.jointMarginalCovariance(keys).fullMatrix()
-        again = (6 * at[:, None] + np.arange(6)).ravel()
-        P = P[again[:, None], again]
+        rows = (6 * at[:, None] + np.arange(6)).ravel()
+        P = P[rows[:, None], rows]
         return np.asarray(0.5 * (P + P.T))
 
 
 def _kind(s: SmootherState) -> tuple[bool, int]:
     """What a graph is built for: whether landmarks are known in the world, and which revision of the measurements."""
-    return s.anchored, s.revisions
+    return s.fixed, s.revisions
 
 
-def held(s: SmootherState, number: int) -> tuple[Array, Array]:
-    """Covariance of the prior of a pose that comes first (6, 6), and what is known of it in the world besides.
+def first_prior(s: SmootherState, number: int) -> tuple[Array, Array]:
+    """Covariance of the prior of a pose that comes first (6, 6), and its covariance in the world besides.
 
     What was measured from the pose with which the problem begins is in the graph, and not in its prior. Of a later one
-    it is in both: what known landmarks told of it is not told again, see `Tracks`.
+    it is in both; but what known landmarks told of it is not told again, see `Tracks`.
     """
     P = s.prior if number == s.begun else s.spread[s.of(number)]
-    if s.anchored:
+    if s.fixed:
         return P, np.zeros((6, 6))
     prior = np.diag(np.minimum(np.diag(P), _FIRM))
     base = joint.root(P - prior)
     return prior, base @ base.T
-
-
-def by_pose(T: Array, position: Array) -> Array:
-    """Derivatives (3, 6) of a point (3,) in the world that is fixed to a pose T (4, 4)."""
-    return np.asarray(T[:3, :3] @ points_by_pose(transform(inverse(T), position[None]))[0])
 
 
 def minimised(problem: GraphProblem, iterations: int) -> gtsam.Values:

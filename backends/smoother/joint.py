@@ -1,8 +1,7 @@
 """The joint covariance (18, 18) of the anchor and the last two poses, and how it changes.
 
-It is that of three errors: of the anchor in the world, and of the last but one and the last pose relative to the anchor.
-However little is known of the place in the world, what is relative keeps its digits. Errors are perturbations on the
-right.
+It is that of three errors, perturbations on the right: of the anchor in the world, and of the last but one and the last
+pose relative to the anchor. However little is known of the place in the world, what is relative keeps its digits.
 """
 
 from __future__ import annotations

@@ -20,18 +20,13 @@ class Sight(Table):
     """What was measured from one pose."""
 
     serials: IdArray  # of the landmarks (M,)
-    factor: IndexArray  # which of each one's smart factors it goes into (M,), see `SmootherLandmarks.factor`
+    since: IndexArray  # which of each one's smart factors it goes into (M,), see `SmootherLandmarks.since`
     z: Array  # measurements (M, 3) of the rectified rig, uR NaN where missing
 
     @classmethod
     def none(cls) -> Sight:
         """Nothing."""
         return cls(np.zeros(0, np.int64), np.zeros(0, np.intp), np.zeros((0, 3)))
-
-    @classmethod
-    def of(cls, marks: SmootherLandmarks, rows: IndexArray, z: Array) -> Sight:
-        """Of measurements z (M, 3) that landmarks have just had."""
-        return cls(marks.serial[rows], marks.factor[rows], z)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,12 +91,12 @@ class SmootherState:
         return self.first + len(self.poses) - 1
 
     @property
-    def anchored(self) -> bool:
-        """Whether landmarks are known in the world: then the path may not be moved in it."""
+    def fixed(self) -> bool:
+        """Whether landmarks are known in the world, so that the path may not be moved in it."""
         return any(known.pose < 0 for known in self.known.values())
 
     @property
-    def own(self) -> Array:
+    def relative(self) -> Array:
         """Covariance (6, 6) of the newest pose's error relative to the anchor."""
         return self.joint[12:, 12:]
 
@@ -110,7 +105,7 @@ class SmootherState:
         """By how much (6, 6) the last but one pose's error relative to the anchor follows the newest one's."""
         if self.number == self.begun:
             return np.zeros((6, 6))
-        return np.asarray(np.linalg.solve(self.own, self.joint[12:, 6:12]).T)
+        return np.asarray(np.linalg.solve(self.relative, self.joint[12:, 6:12]).T)
 
     def intervals(self, number: int) -> tuple[float, float | None]:
         """Time [s] from the pose before to a pose, and from the one before that; None where there is none."""

@@ -52,13 +52,12 @@ class Steps(RectifiedMeasurement):
             sigmas = np.repeat([self.models.initial_rotation_sigma, self.models.initial_position_sigma], 3)
             P: Array = np.diag(sigmas**2)
             return _begun(replace(s, poses=T[None], spread=P[None], ages=np.zeros(1, np.intp)), T, P)
-        s = replace(s, poses=np.concatenate([s.poses, s.poses[-1:]]), ages=np.append(s.ages, s.ages[-1]))
-        T, J, noise, _ = s.moved(self.models, s.number)
+        T, J, noise, _ = s.moved(self.models, s.number + 1)
         P = joint.moved(s.joint, J, noise)
         spread = joint.in_world(P, s.poses[s.of(s.anchor)], T)
         return replace(
-            s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread, spread[None]]), joint=P,
-            by_rig=np.concatenate([s.by_rig[6:], J @ s.by_rig]),
+            s, poses=np.concatenate([s.poses, T[None]]), ages=np.append(s.ages, s.ages[-1]), joint=P,
+            spread=np.concatenate([s.spread, spread[None]]), by_rig=np.concatenate([s.by_rig[6:], J @ s.by_rig]),
         )  # fmt: skip
 
     def in_view(self, s: SmootherState) -> tuple[IndexArray, Array, Array, Array]:
@@ -67,7 +66,7 @@ class Steps(RectifiedMeasurement):
         rows = rows[self.visible(T, marks.position[rows])]
         local, own = pose_only.seen_from(T, marks.position[rows], marks.from_newest[rows])
         by_pose = points_by_pose(local)
-        by_motion = np.where(marks.world[rows, None, None], s.spread[-1], s.own)
+        by_motion = np.where(marks.world[rows, None, None], s.spread[-1], s.relative)
         C = own + by_pose @ by_motion @ np.swapaxes(by_pose, 1, 2)
         return rows, *self.pixels(local, C)
 
@@ -103,7 +102,7 @@ class Steps(RectifiedMeasurement):
         T, marks = s.poses[-1], s.landmarks
         local, own = pose_only.seen_from(T, marks.position[rows], marks.from_newest[rows])
         noise = pose_only.residual_noise(self.stereo, self.models.pixel_sigma, local, own, z)
-        P = s.spread[-1] if s.anchor == s.number or marks.world[rows].any() else s.own
+        P = s.spread[-1] if s.anchor == s.number or marks.world[rows].any() else s.relative
         probability = self.models.gate_probability
         return pose_only.PoseProblem(self.stereo, marks.position[rows], z, noise, T, np.linalg.inv(P), probability)
 
@@ -124,20 +123,17 @@ class Steps(RectifiedMeasurement):
             information = H + np.tril(H, -1).T - one.information
             if np.linalg.eigvals(np.linalg.solve(one.information, information)).real.min() > 1:  # more than the motion
                 return _alone(s, found.T, information), nis, ""
-        linear = math.sqrt(self.stereo.f / self.models.pixel_sigma)
-        marks = s.landmarks.with_variables(seen, one.z, number, self.track, self.config.landmarks, found.T, linear)
-        marks = marks.measured(seen, one.z, number, self.track, s.oldest(self.config.lag, number), graph.number)
-        after = replace(
-            _seeing(s), sights=(*s.sights[:-1], Sight.of(marks, seen, one.z)), landmarks=marks,
-            poses=np.concatenate([s.poses[:-1], found.T[None]]),
-        )  # fmt: skip
+        ratio = math.sqrt(self.stereo.f / self.models.pixel_sigma)
+        marks = s.landmarks.with_variables(seen, one.z, number, self.track, self.config.landmarks, found.T, ratio)
+        after = replace(_seeing(s), landmarks=marks, poses=np.concatenate([s.poses[:-1], found.T[None]]))
+        after = self._measured(after, seen, one.z, s.oldest(self.config.lag, number))
         solved, why = graph.followed(after)
         after = self.settled(after, solved)
         marks = after.landmarks.without_variables(number) if why else after.landmarks
         return replace(after, landmarks=marks.left_behind(seen, after.poses[-1], solved.drift)), nis, why
 
     def _considered(self, s: SmootherState, one: pose_only.PoseProblem, T: Array, seen: IndexArray) -> SmootherState:
-        """With derivatives by errors of the rig as they are after measurements, which put the newest pose at T (4, 4)."""
+        """With derivatives by errors of the rig after measurements, which put the newest pose at T (4, 4)."""
         marks, sigma = s.landmarks, self.models.pixel_sigma
         own, by_rig = marks.from_newest[seen], marks.by_rig.copy()
         pose, by_rig[seen] = considered(one, T, s.by_rig[6:], by_rig[seen], self.field(one.z), own, sigma)
@@ -148,10 +144,14 @@ class Steps(RectifiedMeasurement):
         self, s: SmootherState, graph: Graph, T: Array, P: Array, seen: IndexArray, z: Array
     ) -> tuple[SmootherState, float, str]:
         """As `_corrected`, with the newest pose, at T (4, 4) with a covariance P (6, 6), as the first of a problem."""
-        s = _begun(_seeing(s), T, P)
-        marks = s.landmarks.measured(seen, z, s.number, self.track)
-        s = replace(s, sights=(*s.sights[:-1], Sight.of(marks, seen, z)), landmarks=marks)
+        s = self._measured(_begun(_seeing(s), T, P), seen, z, s.number)
         return self.settled(s, graph.rebuilt(s)), float("nan"), ""
+
+    def _measured(self, s: SmootherState, rows: IndexArray, z: Array, oldest: int) -> SmootherState:
+        """With measurements z (M, 3) of landmarks from the newest pose; see `SmootherLandmarks.measured`."""
+        marks = s.landmarks.measured(rows, z, s.number, self.track, oldest, s.solved)
+        sight = s.sights[-1].joined(Sight(marks.serial[rows], marks.since[rows], z))
+        return replace(s, landmarks=marks, sights=(*s.sights[:-1], sight))
 
     def _saw_the_same(self, s: SmootherState, serials: IdArray) -> bool:
         """Whether the newest pose measured at least half of what the last one in the graph did, not long ago."""
@@ -161,7 +161,7 @@ class Steps(RectifiedMeasurement):
 
     def settled(self, s: SmootherState, solved: Solved) -> SmootherState:
         """The state with what the graph says: the newest pose is the anchor."""
-        poses = np.concatenate([s.poses[: s.of(solved.first)], solved.poses])
+        poses = np.concatenate([s.poses[: s.of(solved.oldest)], solved.poses])
         spread = np.concatenate([s.spread[: -len(solved.spread)], solved.spread])
         marks = s.landmarks.refined(self.stereo, self.models.pixel_sigma, s.first, poses)
         marks = marks.solved(solved.serials, solved.points, solved.linearised)
@@ -183,11 +183,10 @@ class Steps(RectifiedMeasurement):
         Raises MeasurementError where one is in the map already, or has no right pixel or no positive depth.
         """
         s.landmarks.require_new(ids)
-        s = _anchored(s)
-        marks, new = _seen_from_newest(s, ids, *self.first_sight(ids, z)), np.arange(len(ids))
-        marks = replace(marks, information=np.zeros_like(marks.information)).measured(new, z, s.number, self.track)
-        s = replace(s, sights=(*s.sights[:-1], s.sights[-1].joined(Sight.of(marks, new, z))))
-        return _with(s, marks)
+        s, rows = anchored(s), len(s.landmarks) + np.arange(len(ids))
+        marks = _seen_from_newest(s, ids, *self.first_sight(ids, z))
+        s = _with(s, replace(marks, information=np.zeros_like(marks.information)))
+        return self._measured(s, rows, z, 0)
 
     def inserted(self, s: SmootherState, ids: IdArray, positions: Array, covariances: Array) -> SmootherState:
         """With landmarks known in the world; see `slam.interfaces.MapBackend.insert`."""
@@ -198,7 +197,7 @@ class Steps(RectifiedMeasurement):
 
     def placed(self, s: SmootherState, ids: IdArray, local: Array, covariances: Array) -> SmootherState:
         """With landmarks known in the newest camera's coordinates; see `slam.interfaces.MapBackend.place`."""
-        s = _anchored(s)
+        s = anchored(s)
         marks = _seen_from_newest(s, ids, local, covariances, np.zeros((len(ids), 3, s.by_rig.shape[1])))
         known = {n: Known(x, P, s.number) for n, x, P in zip(marks.serial.tolist(), local, covariances)}
         return replace(_with(s, marks), known={**s.known, **known})
@@ -223,9 +222,9 @@ class Steps(RectifiedMeasurement):
         for begin in range(oldest, last + 1, _PART):
             here, end = np.flatnonzero((newest >= begin) & (newest < begin + _PART)), min(begin + _PART - 1, last)
             if len(here):
-                joint, poses = graph.joint_covariance(s, begin - _PART, end)[1], s.poses[: s.of(end) + 1]
-                C[here] = marks.covariances(self.stereo, self.models.pixel_sigma, rows[here], s.first, poses, joint)
-        for i in np.flatnonzero(marks.factor[rows] == VARIABLE):
+                P, poses = graph.joint_covariance(s, begin - _PART, end)[1], s.poses[: s.of(end) + 1]
+                C[here] = marks.covariances(self.stereo, self.models.pixel_sigma, rows[here], s.first, poses, P)
+        for i in np.flatnonzero(marks.since[rows] == VARIABLE):
             found = graph.landmark_covariance(s, int(marks.serial[rows[i]]), marks.position[rows[i]])
             C[i] = C[i] if found is None else found
         return C
@@ -243,8 +242,8 @@ def _begun(s: SmootherState, T: Array, P: Array) -> SmootherState:
     """
     return replace(
         s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread[:-1], P[None]]),
-        joint=joint.alone(P), prior=P, start=T,
-        begun=s.number, anchor=s.number, landmarks=s.landmarks.without_measurements(np.ones(len(s.landmarks), bool)),
+        joint=joint.alone(P), prior=P, start=T, begun=s.number, anchor=s.number,
+        landmarks=s.landmarks.without_measurements(np.ones(len(s.landmarks), bool)),
         known={serial: one for serial, one in s.known.items() if one.pose < 0},
     )  # fmt: skip
 
@@ -255,7 +254,7 @@ def _alone(s: SmootherState, T: Array, information: Array) -> SmootherState:
     The next poses are not known better by it: their measurements would be taken for independent of these, though the
     landmarks' errors are the same.
     """
-    before = np.linalg.inv(s.own)
+    before = np.linalg.inv(s.relative)
     less = before - before @ np.linalg.inv(before + information) @ before
     earlier = s.poses[-2] @ exp(s.gain @ log(inverse(s.poses[-1]) @ T))
     P = joint.in_world(s.joint - s.joint[:, 12:] @ less @ s.joint[12:], s.poses[s.of(s.anchor)], T)
@@ -263,7 +262,7 @@ def _alone(s: SmootherState, T: Array, information: Array) -> SmootherState:
     return replace(s, poses=poses, spread=np.concatenate([s.spread[:-1], P[None]]))
 
 
-def _anchored(s: SmootherState) -> SmootherState:
+def anchored(s: SmootherState) -> SmootherState:
     """With the newest pose as the anchor, where it is predicted if nothing was measured.
 
     Nothing but the motion ties it to the last: where it may have turned anyhow, the problem begins anew.
@@ -271,7 +270,7 @@ def _anchored(s: SmootherState) -> SmootherState:
     if s.anchor == s.number:
         return s
     s = _left_behind(s)
-    if unknown_turn(s.own):
+    if unknown_turn(s.relative):
         return _begun(s, s.poses[-1], s.spread[-1])
     by_anchor = adjoint(inverse(s.poses[-1]) @ s.poses[s.of(s.anchor)])
     return replace(s, joint=joint.anchored(s.joint, by_anchor, s.poses[-2:]), anchor=s.number)
@@ -289,7 +288,7 @@ def _without_dark(s: SmootherState) -> SmootherState:
 
 def _left_behind(s: SmootherState) -> SmootherState:
     """With the newest pose as one that saw something, and landmarks relative to it though it measured none."""
-    return replace(_seeing(s), landmarks=s.landmarks.left_behind(np.zeros(0, np.intp), s.poses[-1], s.own))
+    return replace(_seeing(s), landmarks=s.landmarks.left_behind(np.zeros(0, np.intp), s.poses[-1], s.relative))
 
 
 def _seeing(s: SmootherState) -> SmootherState:

@@ -282,7 +282,7 @@ def test_a_landmark_measured_for_longer_than_the_lag_keeps_what_was_known_of_it(
     estimate = kept.estimate()
     off = estimate.positions - data.points[estimate.ids]
     distances = np.einsum("ni,nij,nj->n", off, np.linalg.inv(estimate.covariances), off)
-    assert np.median(distances) < 6 and (kept.state.landmarks.factor == VARIABLE).sum() >= 4
+    assert np.median(distances) < 6 and (kept.state.landmarks.since == VARIABLE).sum() >= 4
 
 
 def test_landmarks_that_are_variables_outlast_more_than_a_lag_of_frames_that_measured_nothing():
@@ -294,10 +294,10 @@ def test_landmarks_that_are_variables_outlast_more_than_a_lag_of_frames_that_mea
         else:
             step(backend, stamp, seen, known)
         if k == 39:
-            before, variables = backend.estimate(landmarks=False), backend.state.landmarks.factor == VARIABLE
+            before, variables = backend.estimate(landmarks=False), backend.state.landmarks.since == VARIABLE
     after = backend.estimate(landmarks=False)
     assert backend.rebuilds == 0 and variables.sum() >= 4
-    assert (backend.state.landmarks.factor[: len(variables)] == VARIABLE)[variables].all()
+    assert (backend.state.landmarks.since[: len(variables)] == VARIABLE)[variables].all()
     deviations = [np.sqrt(np.trace(e.covariance[3:, 3:])) for e in (before, after)]
     assert deviations[1] < 1.5 * deviations[0], deviations
     assert errors(after.T_world_left, data.poses[-1])[0] < 3 * deviations[1]
