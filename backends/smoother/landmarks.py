@@ -168,31 +168,28 @@ class SmootherLandmarks(LandmarkRows):
         )
         return replace(self, position=position, own=own)
 
-    def covariances(
-        self, stereo: RectifiedStereo, sigma: float, chosen: IndexArray, first: int, poses: Array, joint: Array
-    ) -> Array:
-        """Covariances (M, 3, 3) in the world of some landmarks, given that of the last poses, `joint` (6 K, 6 K).
+    def covariances(self, chosen: IndexArray, newest: int, poses: Array, spread: Array) -> Array:
+        """Covariances (M, 3, 3) in the world of some landmarks: ``C + J P Jᵀ``.
 
-        With the information ``I_j = E_jᵀE_j`` of each measurement on the landmark, and G_j as how a point moves that is
-        fixed to pose j, ``∂l/∂x_j = (ΣI)⁻¹ I_j G_j``: each pose carries the landmark along by its share of the
-        information. Measurements from earlier poses than these count for the first of them. A landmark that was never
-        measured is carried by the newest, with the drift since it is known. All `poses` (N, 4, 4) are from number
-        `first` on.
+        C is known where all poses are. The landmark moves with the pose that measured it last, of which P was known
+        when it was the newest, by ``J = (1 − C Λ) G``: G as a point that is fixed to the pose, less what is known of it
+        in the world beforehand, Λ. One that was never measured moves with the newest pose, and by the drift since it is
+        known. The last of the `poses` (K, 4, 4), with covariances `spread` (K, 6, 6), is of number `newest`.
         """
-        marks, n, width = self.select(chosen), len(chosen), len(joint)
-        frames = np.where(marks.pose >= 0, (marks.pose - first).clip(0), -1)
-        older = np.where(marks.world[:, None, None], 0.0, marks.information)
-        J = kernels.carried_by(
-            stereo.intrinsics, poses, width // 6, frames, marks.z, sigma, marks.position, older, marks.own
-        )
-        C = marks.own + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
-        C[frames.max(axis=1) < 0] += marks.away[frames.max(axis=1) < 0]
+        marks, last = self.select(chosen), self.pose[chosen].max(axis=1, initial=-1)
+        row = (np.where(last < 0, newest, last) - newest - 1).clip(-len(poses))
+        J = by_pose(poses[row], marks.position)
+        J[marks.world] -= (marks.own @ marks.information @ J)[marks.world]
+        C = marks.own + J @ spread[row] @ np.swapaxes(J, 1, 2)
+        C[last < 0] += marks.away[last < 0]
         return np.asarray(0.5 * (C + np.swapaxes(C, 1, 2)))
 
 
 def by_pose(T: Array, points: Array) -> Array:
-    """Derivatives (M, 3, 6) of points (M, 3) in the world that are fixed to a pose T (4, 4)."""
-    return np.asarray(T[:3, :3] @ points_by_pose((points - T[:3, 3]) @ T[:3, :3]))
+    """Derivatives (M, 3, 6) of points (M, 3) in the world that are fixed to one pose T (4, 4), or to M of them."""
+    R = T[..., :3, :3]
+    local = (np.swapaxes(R, -1, -2) @ (points - T[..., :3, 3])[:, :, None])[:, :, 0]
+    return np.asarray(R @ points_by_pose(local))
 
 
 def inverses(H: Array) -> Array:

@@ -22,7 +22,6 @@ from slam.window.recovery import Agreement, agreement, unknown_turn, world_covar
 from slam.window.stereo import RectifiedMeasurement
 
 _DARK = 100  # frames without a measurement after which the problem begins anew: they would be poses of the graph
-_PART = 64  # cost: poses whose joint covariance is wanted at once, and as many before them
 _SAME = 0.5  # share of a pose's landmarks that another one must measure to say nothing new
 
 
@@ -212,18 +211,9 @@ class Steps(RectifiedMeasurement):
         return replace(s, landmarks=s.landmarks.select(keep))
 
     def landmark_covariances(self, s: SmootherState, graph: Graph, rows: IndexArray) -> Array:
-        """Covariances (M, 3, 3) of landmarks in the world.
-
-        A landmark is carried by the poses that measured it last: of a long path a part at a time is enough.
-        """
-        marks, last = s.landmarks, max(s.anchor, s.solved)
-        newest, oldest = marks.pose[rows].max(axis=1, initial=-1), s.oldest(self.config.lag, s.number)
-        C, newest = np.zeros((len(rows), 3, 3)), np.where(newest < 0, last, newest).clip(oldest, last)
-        for begin in range(oldest, last + 1, _PART):
-            here, end = np.flatnonzero((newest >= begin) & (newest < begin + _PART)), min(begin + _PART - 1, last)
-            if len(here):
-                P, poses = graph.joint_covariance(s, begin - _PART, end)[1], s.poses[: s.of(end) + 1]
-                C[here] = marks.covariances(self.stereo, self.models.pixel_sigma, rows[here], s.first, poses, P)
+        """Covariances (M, 3, 3) of landmarks in the world."""
+        marks, end = s.landmarks, s.of(s.anchor) + 1
+        C = marks.covariances(rows, s.anchor, s.poses[:end], s.spread[:end])
         for i in np.flatnonzero(marks.since[rows] == VARIABLE):
             found = graph.landmark_covariance(s, int(marks.serial[rows[i]]), marks.position[rows[i]])
             C[i] = C[i] if found is None else found

@@ -11,7 +11,7 @@ import pytest
 
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
-from backends.smoother.landmarks import VARIABLE, SmootherLandmarks
+from backends.smoother.landmarks import VARIABLE
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
@@ -94,16 +94,6 @@ def test_points_at_a_disparity_of_noise_do_not_rebuild_the_graph():
     """Noise puts some behind a camera, which gtsam's factor throws at: the graph was built anew once every lag."""
     backend = SmootherBackend(RIG, EstimatorModels(MotionModel(1.0, 0.3), 0.7, initial_velocity_sigma=15.0))
     assert not any(report.reason for report in run(backend, with_far_points(40, 8.0))[1:]) and backend.rebuilds == 0
-
-
-def test_covariances_along_a_whole_path_are_found_a_part_at_a_time(monkeypatch):
-    backend, widths, joint = SmootherBackend(RIG, MODELS, lag=None), [], SmootherLandmarks.covariances
-    run(backend, drive(100, points=300, limit=10))
-    monkeypatch.setattr(SmootherLandmarks, "covariances", lambda *a: widths.append(len(a[-1]) // 6) or joint(*a))
-    found = [backend.estimate().covariances]
-    assert len(widths) > 1 and max(widths) <= 100
-    monkeypatch.setattr("backends.smoother.steps._PART", 1000)
-    np.testing.assert_allclose(backend.estimate().covariances, found[0], rtol=1e-6, atol=1e-12)
 
 
 def enter(backend, k: int, stamp: float, seen: Observations) -> None:
