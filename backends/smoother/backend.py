@@ -31,7 +31,8 @@ class SmootherBackend:
 
     The newest pose and each landmark are estimated twice: the pose from the landmarks as they stand, which gates its
     measurements (`slam.window.pose_only`), then by the graph; the landmark within its smart factor, then from its last
-    measurements and the graph's poses, which is where it stands.
+    measurements and the poses as the graph has them. It stands where these put it, as they outlive the lag and the
+    factor: a landmark that comes back is where it was left.
 
     Args:
         rig: the cameras, rectified.
@@ -123,12 +124,12 @@ class SmootherBackend:
     def recent(self, n: int) -> RecentPoses:
         """The last camera poses, at most n and as many as are in the graph, with their joint covariance."""
         s, n = self._started("recent"), require_recent("smoother", n)
-        first, P = self._graph.joint_covariance(s, max(s.begun, s.number + 1 - n), s.number)
+        first, P = self._graph.joint_covariance(s, s.number + 1 - n)
         return RecentPoses(s.stamps[s.of(first) :], s.poses[s.of(first) :], 0.5 * (P + P.T))
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
-        """See `slam.interfaces.Backend.trajectory`: poses that have left the lag are final."""
+        """See `slam.interfaces.Backend.trajectory`: poses that have left the lag move as one, by `revise` alone."""
         s = self.state
         return Trajectory(np.append(s.left_stamps, s.stamps), np.concatenate([s.left_poses, s.poses]))
 

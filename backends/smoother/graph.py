@@ -181,19 +181,19 @@ class Graph:
         self.number = s.number
         return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, shared, drift @ drift.T, spread)
 
-    def joint_covariance(self, s: SmootherState, first: int, last: int) -> tuple[int, Array]:
-        """Number of the first pose, and the joint covariance (6 K, 6 K) of the poses from there to the `last`.
+    def joint_covariance(self, s: SmootherState, first: int) -> tuple[int, Array]:
+        """Number of the first pose, and the joint covariance (6 K, 6 K) of the poses from there to the newest.
 
-        It begins at `first`, or at the oldest pose in the graph; where the graph is not the state's, at the last one.
+        It begins at `first`, or at the oldest pose in the graph; where the graph is not the state's, at the newest.
         Poses that are not in the graph yet follow from the motion model.
         """
         if not self._is_of(s):
-            return last, s.spread[s.of(last)]
-        oldest, solved = s.oldest(self._lag, self.number), self.number
+            return s.number, s.spread[-1]
+        oldest = s.oldest(self._lag, self.number)
         first = max(oldest, first)
-        begin = max(oldest, min(first, solved - 1))  # where the motion goes on, it needs two poses
-        P = self._covariance(list(range(begin, min(solved, last) + 1)))
-        for number in range(solved + 1, last + 1):
+        begin = max(oldest, min(first, self.number - 1))  # where the motion goes on, it needs two poses
+        P = self._covariance(list(range(begin, self.number + 1)))
+        for number in range(self.number + 1, s.number + 1):
             _, J, noise, _ = s.moved(self._make.models, number)
             J = J[:, -len(P) :]
             cross = J @ P[-J.shape[1] :]
@@ -201,7 +201,7 @@ class Graph:
             P = np.block([[P, cross.T], [cross, 0.5 * (own + own.T)]])  # what is not symmetric would grow fourfold
             gain = np.linalg.solve(P[-6:, -6:], P[-6:])  # a pose that was solved for alone is known better
             P = P + gain.T @ (s.spread[s.of(number)] - P[-6:, -6:]) @ gain
-        rows = slice(6 * (first - begin), 6 * (last + 1 - begin))
+        rows = slice(6 * (first - begin), None)
         return first, P[rows, rows]
 
     def landmark_covariance(self, s: SmootherState, serial: int, position: Array) -> Array | None:

@@ -395,12 +395,15 @@ def test_a_known_landmark_tells_what_is_known_of_it():
 # --- what goes on from one graph to the next ---
 
 
-def test_a_predicted_pose_has_the_covariance_of_the_velocity_that_it_moves_on_with():
-    """The velocity is that between the last two poses, whose errors it has a part in."""
+@pytest.mark.parametrize("off", [None, 2.0])
+def test_a_predicted_pose_has_the_covariance_of_the_velocity_that_it_moves_on_with(off):
+    """The velocity is that between the last two poses, whose errors it has a part in; also after a revision."""
     models, known = EstimatorModels(MotionModel(0.1, 0.02), pixel_sigma=2.0), set()
     backend = SmootherBackend(RIG, models)
     for stamp, _, seen in drive(12, points=60, limit=14):
-        step(backend, stamp, seen, known)
+        step(backend, stamp, seen if off is None else off_by(seen, -off), known)
+    if off is not None:
+        backend.revise(lambda z: z + np.array([0.0, 0.0, off]))
     last = backend.recent(2)
     for k in range(2):
         predicted = backend.predict(1.2 + 0.1 * k)
