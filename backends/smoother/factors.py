@@ -78,8 +78,9 @@ class FactorMaker:
 
         The papers' velocity jumps when an interval begins and then stays: it is the difference of two poses, and a
         variable for it would only repeat it. gtsam linearises this factor where it linearises the rest: at other poses
-        it would pull at the path as a whole, which nothing else holds. `keys` are three successive poses with the times `dt` (2,) [s] between them; or two of which
-        the first velocity is unknown, and then the first time does not count.
+        it would pull at the path as a whole, which nothing else holds. `keys` are three successive poses with the times
+        `dt` (2,) [s] between them; or two of which the first velocity is unknown, and then the first time does not
+        count.
         """
         n, before, last = len(keys), float(dt[0]), float(dt[1])
 

@@ -51,7 +51,9 @@ class Solved:
     points: Array  # where they are (V, 3),
     linearised: Array  # and where they are linearised (V, 3)
     joint: Array  # covariance (18, 18) of the last pose, which is the anchor, see `backends.smoother.joint`
-    drift: Array  # by how much (6, 6) the last pose is less certain than the anchor before it
+    # By how much (6, 6) the last pose is less certain than the anchor before it: over many frames this adds up to the
+    # path's drift. The covariance of the motion would not, as each frame has an error of its own that the next forgets.
+    drift: Array
     spread: Array  # covariances (N, 6, 6) of those that are new
 
     def displaced(self, M: Array) -> Solved:
@@ -160,6 +162,10 @@ class Graph:
             track.slot = slots[place]
         self._tracks.forget(s, oldest)
         new = [i for i in numbers if i >= oldest] if self._poses else [s.number]
+        return self._solution(s, oldest, new, kept, values)
+
+    def _solution(self, s: SmootherState, oldest: int, new: list[int], kept: list[int], values: gtsam.Values) -> Solved:
+        """What gtsam found, in the state's coordinates: `new` poses, and variables of landmarks that are `kept`."""
         poses = self._to_state @ [values.atPose3(pose_key(i)).matrix() for i in range(oldest, s.number + 1)]
         self._poses = dict(zip(range(oldest, s.number + 1), poses))
         points, linearised = (
@@ -167,17 +173,15 @@ class Graph:
             for v in (values, self._solver.getLinearizationPoint() if kept else values)
         )
         at = [max(oldest, i) for i in (s.anchor, s.number - 1, s.number)]
-        before, T0, T = poses[np.array(at) - oldest]
         P = self._relative(at)
-        spread = np.array([*(self._covariance([i]) for i in new[:-1]), (P + self._rigid(at))[12:, 12:]])
-        shared = joint.anchored(P, np.zeros((6, 6)), np.array([T0, T]))
-        shared[:6, :6] = spread[-1]
-        # the covariance of the motion between them, were that independent of the anchor's error; of many successive
-        # motions these add up to what the path drifts by
-        A = adjoint(inverse(T) @ before)
-        drift = joint.root(P[12:, 12:] - A @ P[:6, :6] @ A.T)
-        if not (np.isfinite(poses).all() and np.isfinite(shared).all() and (np.diag(P) > 0).all()):
+        if not (np.isfinite(poses).all() and np.isfinite(P).all() and (np.diag(P) > 0).all()):
             raise SolverError("gtsam: the solution is not finite, or a variance not positive")
+        spread = np.array([*(self._covariance([i]) for i in new[:-1]), (P + self._rigid(at))[12:, 12:]])
+        anchor, before, newest = poses[np.array(at) - oldest]
+        shared = joint.anchored(P, np.zeros((6, 6)), np.array([before, newest]))
+        shared[:6, :6] = spread[-1]
+        A = adjoint(inverse(newest) @ anchor)
+        drift = joint.root(P[12:, 12:] - A @ P[:6, :6] @ A.T)
         self.number = s.number
         return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, shared, drift @ drift.T, spread)
 
