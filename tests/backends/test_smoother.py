@@ -235,19 +235,25 @@ def test_what_is_known_of_a_landmark_outlasts_the_poses_that_measured_it():
     for what, number in (("position", 1), ("own", 2)):
         expected = np.array([seen_last[i][number] for i in old])
         np.testing.assert_allclose(getattr(marks, what)[marks.rows_of(old)], expected, rtol=1e-6, atol=1e-9)
+    assert np.linalg.eigvalsh(backend.estimate().covariances).min() > 0, "also where no pose is kept any more"
 
 
-def test_landmarks_behind_the_camera_are_as_uncertain_as_the_poses_that_saw_them():
+def test_landmarks_behind_the_camera_are_as_uncertain_as_when_they_were_seen_last():
     """Their measurements were taken for some of a later pose, which sees nothing behind it: a median NEES of 70."""
-    poses = path(100, DT, np.array([0.0, 0.0, 4.0]), np.zeros(3))
+    poses, known = path(100, DT, np.array([0.0, 0.0, 4.0]), np.zeros(3)), set()
     models = EstimatorModels(MotionModel(1.0, 0.3), 0.7, initial_velocity_sigma=15.0)
-    backend, data = SmootherBackend(RIG, models), scene(poses, points=1000, limit=40, sigma=0.7)
-    run(backend, data)
-    found = backend.estimate()
+    backend, data, then = SmootherBackend(RIG, models), scene(poses, points=1000, limit=40, sigma=0.7), {}
+    for stamp, _, seen in data:
+        step(backend, stamp, seen, known)
+        found = backend.estimate()
+        P = dict(zip(found.ids.tolist(), np.trace(found.covariances, axis1=1, axis2=2)))
+        then.update((i, P[i]) for i in seen.ids.tolist() if i in P)
     off = (found.positions - data.points[found.ids])[:, :, None]
     squared = (np.swapaxes(off, 1, 2) @ np.linalg.solve(found.covariances, off)).ravel()
     passed = data.points[found.ids, 2] < poses[-1][2, 3] - 8
     assert passed.sum() > 20 and np.median(squared[passed]) < 6  # χ²₃: 2.4; they share the path's error
+    grown = np.sqrt([P[i] / then[i] for i in found.ids[passed].tolist()])
+    assert grown.max() < 1.05, "not by the path since"
 
 
 def swaying(frames: int, points: int):
@@ -415,17 +421,3 @@ def test_a_predicted_pose_has_the_covariance_of_the_velocity_that_it_moves_on_wi
         np.testing.assert_allclose(predicted.covariance, P[12:, 12:], rtol=1e-4, atol=1e-9)
         last = backend.recent(2)
         np.testing.assert_allclose(last.covariance[6:, 6:], P[12:, 12:], rtol=1e-4, atol=1e-9)
-
-
-def test_a_landmark_is_carried_by_poses_that_are_kept():
-    """Measurements from others have no pose, and would carry it from a wrong one."""
-    backend, known = SmootherBackend(RIG, MODELS), set()
-    for k, (stamp, _, seen) in enumerate(swaying(102, 40)):
-        step(backend, stamp, seen.select((seen.ids >= 3) | (k % 8 == 0)), known)
-    estimate, marks = backend.estimate(), backend.state.landmarks
-    assert backend.state.first > 0
-    for i in range(3):
-        deviations = [
-            np.sqrt(np.trace(P)) for P in (estimate.covariances[i], marks.own[marks.rows_of(np.array([i]))][0])
-        ]
-        assert deviations[1] < deviations[0] < 1.4 * deviations[1]
