@@ -15,7 +15,7 @@ from slam.bodies.config import CLEAR, MIN_FRAMES
 from slam.bodies.track_kernels import windows_in_body
 from slam.data import BoolArray
 from slam.geometry.arrays import changed
-from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, transform, twice
+from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, so3_exp, transform, twice
 from slam.models import ObjectModels
 from slam.object_data import MovingObject
 from slam.tracks.table import Tracks
@@ -42,7 +42,7 @@ class Body:
     lower: Array  # corner (3,) of the extent of its points, body coordinates
     upper: Array  # the opposite corner
     size: float  # what it measures across at least [m]
-    seen_at: float  # when its points were last found together [s]
+    seen_at: float  # when it was last measured [s]
     velocity_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))  # of the velocity (6, 6)
     seen: int = 1  # number of frames in which it was measured
     missed: int = 0  # number of frames since it was measured
@@ -56,7 +56,6 @@ class Body:
     alike: int = 0  # number of frames in which it moved as an older body did, as a part of that would
     age: int = 0  # number of frames since it was found
     existence: float = EVEN  # probability that it exists, see `slam.bodies.belief`
-    measured_at: float = float("nan")  # when the estimate last used them [s]
     apart_from: int | None = None  # id of the body of which it is a part with a motion of its own; None for none
     distinct: frozenset[int] = frozenset()  # ids of bodies that it is known not to be a part of
     belief: BodyBelief | None = field(default=None, repr=False)  # its estimate; None where there is none yet
@@ -67,17 +66,19 @@ class Body:
         return self.certain >= PROOF and self.agreeing >= SOLID * (self.agreeing + self.against)
 
     @property
-    def unplaced(self) -> bool:
-        """Whether it may be farther from where it is expected, seen from the camera, than it is wide."""
+    def off(self) -> float:
+        """How far its corners may be from where they are expected, seen from the camera: standard deviation [m]."""
         if self.belief is None:
-            return True
-        since = np.trace((self.covariance - self.belief.estimate.covariance)[3:, 3:])
-        return bool(self.belief.spread**2 + since > self.across**2)
+            return math.inf
+        A = adjoint(self.belief.poses[-1])
+        P = A @ self.belief.covariance[-6:, -6:] @ A.T + self.covariance - self.belief.estimate.covariance
+        J = points_by_pose(np.stack([self.lower, self.upper]))
+        return math.sqrt(max(float(np.einsum("nij,jk,nik->", J, P, J)) / len(J), 0.0))
 
     @property
     def gone(self) -> bool:
-        """Whether it is out of view, and may be anywhere."""
-        return self.missed > 1 and self.unplaced
+        """Whether it is out of view, and may be farther from where it is expected than it is wide."""
+        return self.missed > 1 and self.off > self.across
 
     @property
     def solid(self) -> float:
@@ -148,7 +149,7 @@ def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_spe
     certain = float(v @ np.linalg.solve(P, v)) > (9.0 if body.moving else 16.8)  # χ²(6): 83 % and 99 %
     changes: dict[str, Any] = {}
     if estimate.measured:
-        changes = {"seen_at": stamp, "measured_at": stamp, "seen": body.seen + 1, "missed": 0}
+        changes = {"seen_at": stamp, "seen": body.seen + 1, "missed": 0}
     if estimate.measured and belief.since == stamp and body.belief is None:
         body = changed(body, known=np.zeros_like(body.known))  # the estimate began anew: it knows of no earlier pose
     return body.placed(
@@ -182,7 +183,7 @@ def continued(body: Body, known: Body) -> Body:
         certain=known.certain, existence=known.existence, evidence=known.evidence, age=known.age,
         seen=body.seen + known.seen,
         agreeing=body.agreeing + known.agreeing, against=body.against + known.against,
-        measured_at=known.measured_at, distinct=body.distinct | known.distinct, belief=None,
+        distinct=body.distinct | known.distinct, belief=None,
     )  # fmt: skip
 
 
@@ -246,7 +247,7 @@ def reported(bodies: Mapping[int, Body], tracks: Tracks) -> tuple[MovingObject, 
         if body.belief is None or not body.proven:
             continue
         e = body.belief.estimate
-        short = e.stamp - body.measured_at <= _UNMEASURED and body.missed <= UNMEASURED_SHARE * body.seen
+        short = e.stamp - body.seen_at <= _UNMEASURED and body.missed <= UNMEASURED_SHARE * body.seen
         if e.measured or (short and body.existence > EVEN):
             out.append(_report(body, body.belief, tracks))
     return tuple(out)
@@ -269,5 +270,5 @@ def _report(body: Body, belief: BodyBelief, tracks: Tracks) -> MovingObject:
     extent = _enclosing(points) if len(points) > 1 else np.zeros((2, 3))
     return MovingObject(
         body.id, np.sort(rows), estimate, motion, T @ inverse(belief.T_begun), extent, body.moving, belief.since,
-        body.measured_at, body.existence,
+        body.seen_at, body.existence,
     )  # fmt: skip

@@ -281,7 +281,7 @@ class MovingObjectDetector(ObjectDetector):
                 mine = np.flatnonzero((tracks.body == id) & tracks.found)
                 seen = observed(body, tracks, mine, frame.features)
                 belief = self._estimator.updated(None, id, seen, frame.cameras)
-                self.bodies[id] = changed(body, belief=belief, measured_at=frame.features.stamp)
+                self.bodies[id] = changed(body, belief=belief)
 
     def _begin_tracks(self, tracks: Tracks, frame: Frame) -> None:
         """Follow landmarks and stereo features that are not followed yet; give up what was not found for long."""

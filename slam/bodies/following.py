@@ -115,7 +115,8 @@ def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) 
     misfits, but followed on: they may lie on a part that moves otherwise, such as a lid.
     """
     mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
-    some = mine[:0] if len(mine) < MIN_POINTS and body.unplaced else mine  # any two points agree with one of its poses
+    # points agree with some pose of a body that may be half its width off, where they may be taken for each other
+    some = mine[:0] if len(mine) < MIN_POINTS and 2.0 * body.off > body.across else mine
     belief = estimator.updated(body.belief, body.id, observed(body, tracks, some, frame.features), frame.cameras)
     rows = tracks.row[mine]
     tracks.row[mine] = -1
