@@ -261,8 +261,8 @@ def parting(
 ) -> IndexArray:  # fmt: skip
     """Those of the landmarks `at` (K,), seen as features `rows`, that part from the rest of them.
 
-    The camera was at `eyes` (W, 3) in the window's frames. Three are enough, as their displacements are nine numbers: of
-    a body near the camera that begins to move, as many of its landmarks carry the camera along. In a run's first frames
+    The camera was at `eyes` (W, 3) in the window's frames. Three are enough, whose displacements are nine numbers: of a
+    body near the camera that begins to move, as many of its landmarks carry the camera along. In a run's first frames
     single ones part, too, and however many: what moves from the beginning on would else pull the camera along, and the
     world's axes with it.
     """
