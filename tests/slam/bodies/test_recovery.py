@@ -96,9 +96,13 @@ def test_points_that_do_not_agree_say_nothing():
     assert place(body, tracks, features) is None
 
 
-@pytest.mark.parametrize(("deviation", "turn", "measured"), [(0.5, 0.05, True), (2.0, 0.05, False), (0.5, 1.0, False)])
-def test_two_points_say_nothing_of_a_body_that_may_be_anywhere_or_turned_anyhow(deviation, turn, measured):
-    body, tracks, features, _ = scene(2, np.zeros(6), np.random.default_rng(6), deviation)
+@pytest.mark.parametrize(
+    ("seen", "deviation", "turn", "measured"),
+    [(2, 0.5, 0.05, True), (2, 0.5, 1.0, False), (3, 0.5, 1.0, True), (3, 2.0, 0.05, False), (4, 2.0, 0.05, True)],
+)
+def test_the_less_is_known_of_a_body_the_more_points_must_agree(seen, deviation, turn, measured):
+    """It may be where it is expected, turned by a radian, or anywhere."""
+    body, tracks, features, _ = scene(seen, np.zeros(6), np.random.default_rng(6), deviation)
     body = replace(body, covariance=np.diag([turn**2] * 3 + [deviation**2] * 3))
     assert (place(body, tracks, features) is not None) == measured
 
