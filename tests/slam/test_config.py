@@ -43,6 +43,12 @@ def test_settings_reach_their_place():
         ("map.max_landmarks", "not of the form"),
         ("models.pixel_sigma=abc", "models.pixel_sigma must be a number, got 'abc'"),
         ("association.align=often", "association.align must be true or false, got 'often'"),
+        ("objects.min_speed=-1.0", "objects.min_speed must be finite, from 0 to 1e+09, got -1.0"),
+        (
+            "objects.min_speed=1e-12",
+            "objects.min_speed must be finite",
+        ),  # its square, and the inverse of that, are none
+        ("map.max_landmarks=true", "map.max_landmarks must be a whole number, got True"),
         ("models.T_world_left=[1]", "models.T_world_left must be a (4, 4) pose"),
         ("backend.rig=3", "backend.rig: the system gives this"),
         ("map=3", "is a section"),

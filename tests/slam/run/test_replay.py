@@ -16,7 +16,7 @@ from slam.run.recording import RecordedFrame, Recording, load_recording, save_re
 from slam.run.replay import Replay
 from slam.system import StereoSlam
 
-FRAMES = 12
+FRAMES, NONE = 12, np.zeros(0, np.int64)
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +85,16 @@ def test_what_was_corrected_in_a_run_is_corrected_in_its_replay(desk, recording,
         np.testing.assert_array_equal(mended, revisions[k].rows(z))
     assert given[8][0, 2] == pytest.approx(180.3, abs=0.02) and given[11][0, 2] == pytest.approx(179.9, abs=0.02)
     assert len(replay(again, StereoSlam(desk.rig, None, "ekf").backend)) == FRAMES
+
+
+def test_a_landmark_may_leave_in_the_frame_in_which_it_is_added(desk, recording):
+    first, *others = recording.frames
+    (gone,) = first.added.ids[:1]
+    rest = (replace(f, observed=f.observed.select(f.observed.ids != gone), removed=NONE) for f in others)
+    frames = (replace(first, removed=np.array([gone])), *rest)
+    system = Replay(replace(recording, frames=frames), StereoSlam(desk.rig, None, "ekf").backend)
+    last = [result for _, result in system.run()][-1]
+    assert gone not in system.estimate().ids and len(system.estimate().ids) == last.map_size
 
 
 def test_a_file_holds_it_all(recording, tmp_path):
