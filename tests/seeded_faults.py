@@ -81,8 +81,7 @@ FAULTS = (
     # the smoother
     Fault(
         "a landmark out of view forgets earlier drift", "backends/smoother/landmarks.py",
-        "away[unseen] += by_pose @ drift @ np.swapaxes(by_pose, 1, 2)",
-        "away[unseen] = by_pose @ drift @ np.swapaxes(by_pose, 1, 2)",
+        "away[unseen] += J @ drift @ np.swapaxes(J, 1, 2)", "away[unseen] = J @ drift @ np.swapaxes(J, 1, 2)",
     ),
     Fault(
         "what is known of a landmark beforehand is lost from its covariance", "backends/smoother/kernels.py",

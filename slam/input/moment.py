@@ -112,7 +112,8 @@ def _lags(sums: Array, whole: Array, least: float) -> Array:
     total = np.maximum(squares.sum(axis=0), np.finfo(float).tiny)
     lag = -products.sum(axis=0) / total
     sigma = np.sqrt(np.square(products + lag * squares).sum(axis=0)) / total
-    return np.where(lag > np.maximum(least, _SIGMAS * sigma), lag, 0.0)
+    moves = total > _STILL**2 * sums[:, :, 2, 2].sum(axis=0)  # also besides what the calibration explains
+    return np.where(moves & (lag > np.maximum(least, _SIGMAS * sigma)), lag, 0.0)
 
 
 def _fields(points: Array) -> tuple[Array, ...]:
