@@ -28,6 +28,7 @@ from slam.window.stereo import TOO_LATE, Field, RectifiedMeasurement
 
 #: Standard deviations of a known point between it and its anchor: its coordinates are linear there, it stays Gaussian.
 _STAND_OFF = 100.0
+_FARTHEST_ANCHOR = 1e5  # numerics: from a known point [m]; a landmark's inverse depth keeps clear of its least
 _DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large
 
 
@@ -140,7 +141,8 @@ class LandmarkFilter:
         ids, positions, covariances = known
         anchors = np.tile(np.eye(3, 4), (len(ids), 1, 1))
         anchors[:, :, 3] = positions
-        anchors[:, 2, 3] -= np.maximum(_STAND_OFF * np.sqrt(np.trace(covariances, axis1=1, axis2=2)), 1.0)
+        deviations = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+        anchors[:, 2, 3] -= np.clip(_STAND_OFF * deviations, 1.0, _FARTHEST_ANCHOR)
         new = FilterLandmarks.at(self._coordinates, ids, anchors, positions)
         new = replace(new, sights=np.full((len(ids), 3), np.nan))
         D = new.gauge[:, :, :3]
@@ -212,8 +214,9 @@ class LandmarkFilter:
             motion = predicted(s.camera, self.models, s.covariance.camera, stamp - s.stamp, rests)
         T = motion[0].pose
         rows = self._measure.visible(T, s.landmarks.points)
-        after = s.advanced(float(stamp), motion, rows, self._slide)
+        after = s.advanced(float(stamp), motion)
         marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
+        blocks += self._slide.walked(after.landmarks, rows, T[:3, 3])[1]
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
         by_pose = -toward @ (marks.gauge @ displacement(after.camera))  # (M, 3, 6), of them as seen from the camera
         local = (by_pose @ after.covariance.pose + 2 * toward @ cross) @ by_pose.transpose(0, 2, 1)
@@ -233,8 +236,9 @@ class LandmarkFilter:
         rows, z = s.landmarks.rows_of(observations.ids), self._measure.stereo.measure(observations)
         if not self._stereo:
             z[:, 2] = np.nan
+        slid = s.slid(self._slide, rows, (s.pose if guess is None else guess)[:3, 3])
         update = Update(
-            s.camera, s.covariance, s.landmarks.select(rows), rows, z, self._measure, self._coordinates,
+            s.camera, slid.covariance, slid.landmarks.select(rows), rows, z, self._measure, self._coordinates,
             self._iterations,
         )  # fmt: skip
         update = update if guess is None else update.regular_towards(guess)
@@ -248,7 +252,7 @@ class LandmarkFilter:
             if found is None:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids.copy())
-            after = s.corrected(found)
+            after = slid.corrected(found)
         except LinAlgError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self.name}: {error}")
         used = found.used

@@ -25,12 +25,14 @@ def test_settings_reach_their_place():
         [
             "map.max_landmarks=301",
             "backend.measurement=left",
+            "frontend.threads=1",
             "association.d_match=[0.3, 0.2]",
             "models.motion.acceleration=2",
         ]
     )
     assert config.map.max_landmarks == 301
     assert config.backend == {"measurement": "left"}
+    assert config.frontend == SystemConfig.for_kind("driving").frontend | {"threads": 1}
     assert config.association.d_match == (0.3, 0.2)
     assert config.models.motion.acceleration == 2.0
     assert SystemConfig.for_kind("driving").map.max_landmarks != 301
