@@ -56,11 +56,6 @@ class SmootherBackend:
         self._graph = Graph(self.factor_maker, self.config.lag)
         self.state = SmootherState.empty(np.zeros((6, 0)))
 
-    @property
-    def rebuilds(self) -> int:
-        """How often the graph was built anew after a failure of gtsam."""
-        return self._graph.rebuilds
-
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
     @one_blas_thread

@@ -93,7 +93,7 @@ def test_far_landmarks_that_soon_leave_are_not_believed_too_much(seen_at_once, s
 def test_points_at_a_disparity_of_noise_do_not_rebuild_the_graph():
     """Noise puts some behind a camera, which gtsam's factor throws at: the graph was built anew once every lag."""
     backend = SmootherBackend(RIG, EstimatorModels(MotionModel(1.0, 0.3), 0.7, initial_velocity_sigma=15.0))
-    assert not any(report.reason for report in run(backend, with_far_points(40, 8.0))[1:]) and backend.rebuilds == 0
+    assert not any(report.reason for report in run(backend, with_far_points(40, 8.0))[1:])
 
 
 def enter(backend, k: int, stamp: float, seen: Observations) -> None:
@@ -132,7 +132,6 @@ def test_frames_that_measured_nothing_are_no_failure(lag, dark):
         report = step(backend, stamp, seen, known)
         assert not k or (report.status is UpdateStatus.OK and not report.reason), (k, report.reason)
         assert len(report.rejected) < 3
-    assert backend.rebuilds == 0
     last = backend.estimate(landmarks=False)
     off = se3.log(se3.inverse(last.T_world_left) @ data.poses[-1])
     assert off @ np.linalg.solve(last.covariance, off) < 25
@@ -288,11 +287,11 @@ def test_landmarks_that_are_variables_outlast_more_than_a_lag_of_frames_that_mea
         if 40 <= k < 50:
             enter(backend, k, stamp, seen)
         else:
-            step(backend, stamp, seen, known)
+            assert not (step(backend, stamp, seen, known).reason and k), "it is not built anew"
         if k == 39:
             before, variables = backend.estimate(landmarks=False), backend.state.landmarks.since == VARIABLE
     after = backend.estimate(landmarks=False)
-    assert backend.rebuilds == 0 and variables.sum() >= 4
+    assert variables.sum() >= 4
     assert (backend.state.landmarks.since[: len(variables)] == VARIABLE)[variables].all()
     deviations = [np.sqrt(np.trace(e.covariance[3:, 3:])) for e in (before, after)]
     assert deviations[1] < 1.5 * deviations[0], deviations
