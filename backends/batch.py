@@ -16,7 +16,8 @@ import numpy as np
 
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import landmark_key, pose_key
-from backends.smoother.graph import SolverError, by_pose, held, minimised, solving
+from backends.smoother.graph import SolverError, first_prior, minimised, solving
+from backends.smoother.landmarks import by_pose
 from backends.smoother.state import SmootherState
 from backends.smoother.tracks import GraphProblem, Tracks
 from slam.data import Estimate
@@ -87,7 +88,7 @@ class BatchBackend:
         s = self._smoother.state
         if not s.started:
             return self._smoother.trajectory()
-        found, solved = self._smoother.path.trajectory(), self._solved().poses
+        found, solved = self._smoother.trajectory(), self._solved().poses
         found.poses[-len(solved) :] = solved
         return found
 
@@ -106,7 +107,7 @@ class _BatchSolution:
         self.state = s  # what it is the solution for
         numbers = range(s.begun, s.number + 1)
         problem, tracks = GraphProblem(), Tracks(make, None)
-        prior, self._base = held(s, s.begun)
+        prior, self._base = first_prior(s, s.begun)
         problem.factors.add(make.prior(s.begun, s.start, prior))
         for number in numbers:
             tracks.add_pose(problem, s, number, s.begun)
@@ -144,7 +145,7 @@ class _BatchSolution:
         for row in np.flatnonzero(~others).tolist():
             key = landmark_key(serials[row])
             positions[row] = self.values.atPoint3(key)
-            covariances[row] = self.covariance(key, by_pose(self.poses[0], positions[row]))
+            covariances[row] = self.covariance(key, by_pose(self.poses[0], positions[row][None])[0])
         T = self.poses[-1].copy()
         P = self.covariance(pose_key(s.number), adjoint(inverse(T) @ self.poses[0]))
         return Estimate(float(s.stamps[-1]), T, P, marks.ids[rows], positions, covariances)

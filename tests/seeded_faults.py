@@ -58,8 +58,8 @@ NEAREST = {
 FAULTS = (
     # the filter
     Fault(
-        "turning the camera moves points the wrong way", "backends/ekf/motion.py",
-        "W[:3, 3:], W[3:, 3:] = hat(self.x[:3]) @ turn, turn", "W[:3, 3:], W[3:, 3:] = -hat(self.x[:3]) @ turn, -turn",
+        "turning the camera moves points the wrong way", "backends/ekf/camera.py",
+        "hat(camera.pose[:3, 3]) @ turning, turning", "-hat(camera.pose[:3, 3]) @ turning, -turning",
     ),
     Fault(
         "the last poses are corrected as if they were in the state", "backends/ekf/covariance.py",
@@ -81,8 +81,7 @@ FAULTS = (
     # the smoother
     Fault(
         "a landmark out of view forgets earlier drift", "backends/smoother/landmarks.py",
-        "away[unseen] += by_pose @ drift @ np.swapaxes(by_pose, 1, 2)",
-        "away[unseen] = by_pose @ drift @ np.swapaxes(by_pose, 1, 2)",
+        "away[unseen] += J @ drift @ np.swapaxes(J, 1, 2)", "away[unseen] = J @ drift @ np.swapaxes(J, 1, 2)",
     ),
     Fault(
         "what is known of a landmark beforehand is lost from its covariance", "backends/smoother/kernels.py",

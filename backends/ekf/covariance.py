@@ -107,13 +107,11 @@ class Covariance:
         P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
         return replace(self, P=P, by_rig=by_rig)
 
-    def advanced(self, J: Array, noise: Array, by_error: Array, rows: IndexArray, walk: Array) -> Covariance:
-        """As after `camera_moved`, and landmarks (`rows` (M,) of the table) have walked by covariances (M, 3, 3)."""
-        moved, there, known = self.camera_moved(J, noise, by_error), rows < self.correlated, self.known.copy()
-        at = self.numbers(rows[there])
-        moved.P[at[:, :, None], at[:, None, :]] += walk[there]  # nobody else has it yet
-        known[rows[~there] - self.correlated] += walk[~there]
-        return replace(moved, known=known)
+    def walked(self, rows: IndexArray, walk: Array) -> Covariance:
+        """After landmarks (`rows` (M,) of the table, none of those known from elsewhere) walk by (M, 3, 3)."""
+        P, at = self.P.copy(), self.numbers(rows)
+        P[at[:, :, None], at[:, None, :]] += walk
+        return replace(self, P=P)
 
     # --- landmarks join and leave ---
 
@@ -158,7 +156,7 @@ class Covariance:
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
         mirror(P, CAMERA)
         D[:CAMERA], D[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
-        # with T = 1 + [D, 0]: T P Tᵀ = P + D Yᵀ + Y Dᵀ,  Y = P[:, :12] + D P_cc / 2
+        # F P Fᵀ = P + D Yᵀ + Y Dᵀ, with F = 1 + [D, 0] and Y = P[:, :12] + D P_cc / 2
         half = 0.5 * D @ P[:CAMERA, :CAMERA]
         P = dsyr2k(1.0, D, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
         by_rig += D @ by_rig[:CAMERA]

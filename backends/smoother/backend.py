@@ -1,4 +1,4 @@
-"""The smoother back end: the protocol on top of the steps, the graph, and the path."""
+"""The smoother back end: the protocol on top of the steps and the graph."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from backends.smoother.config import SmootherConfig
 from backends.smoother.factors import FactorMaker
 from backends.smoother.graph import Graph
 from backends.smoother.mending import corrected, rebuilt
-from backends.smoother.path import Path
 from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
 from slam.bounds import from_options
@@ -20,7 +19,7 @@ from slam.checks import known_landmarks, require_guess, require_not_measured, re
 from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, RecentPoses, UpdateReport
 from slam.errors import CopyError, MeasurementError
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse
+from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
@@ -32,7 +31,8 @@ class SmootherBackend:
 
     The newest pose and each landmark are estimated twice: the pose from the landmarks as they stand, which gates its
     measurements (`slam.window.pose_only`), then by the graph; the landmark within its smart factor, then from its last
-    measurements and the graph's poses, which is where it stands.
+    measurements and the poses as the graph has them. It stands where these put it, as they outlive the lag and the
+    factor: a landmark that comes back is where it was left.
 
     Args:
         rig: the cameras, rectified.
@@ -41,7 +41,6 @@ class SmootherBackend:
 
     Attributes:
         state: all that is kept: poses, measurements, landmarks.
-        path: all poses.
         factor_maker: makes factors with this back end's rig and models.
 
     Raises:
@@ -56,7 +55,6 @@ class SmootherBackend:
         self.factor_maker = FactorMaker(self._steps.stereo, models)
         self._graph = Graph(self.factor_maker, self.config.lag)
         self.state = SmootherState.empty(np.zeros((6, 0)))
-        self.path = Path()
 
     @property
     def rebuilds(self) -> int:
@@ -81,7 +79,6 @@ class SmootherBackend:
         s = self._steps.predicted(s, float(stamp), rests)
         rows, left, right, S = self._steps.in_view(s)
         found = Prediction(float(stamp), s.poses[-1].copy(), s.spread[-1].copy(), s.landmarks.ids[rows], left, right, S)
-        self.path.follow(s)
         self.state = s
         return found
 
@@ -93,7 +90,6 @@ class SmootherBackend:
         require_not_measured("smoother", s.measured)
         z = self._steps.stereo.measure(observations)
         s, report = self._steps.updated(s, self._graph, observations.ids.copy(), z, guess)
-        self.path.follow(s)
         self.state = s
         return report
 
@@ -103,7 +99,6 @@ class SmootherBackend:
         s = self._started("add")
         if len(observations):
             s = self._steps.added(s, observations.ids.copy(), self._steps.stereo.measure(observations))
-            self.path.follow(s)
             self.state = s
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
@@ -129,13 +124,14 @@ class SmootherBackend:
     def recent(self, n: int) -> RecentPoses:
         """The last camera poses, at most n and as many as are in the graph, with their joint covariance."""
         s, n = self._started("recent"), require_recent("smoother", n)
-        first, P = self._graph.joint_covariance(s, max(s.begun, s.number + 1 - n), s.number)
+        first, P = self._graph.joint_covariance(s, s.number + 1 - n)
         return RecentPoses(s.stamps[s.of(first) :], s.poses[s.of(first) :], 0.5 * (P + P.T))
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
-        """See `slam.interfaces.Backend.trajectory`: poses that have left the lag are final."""
-        return self.path.trajectory()
+        """See `slam.interfaces.Backend.trajectory`: poses that have left the lag move as one, by `revise` alone."""
+        s = self.state
+        return Trajectory(np.append(s.left_stamps, s.stamps), np.concatenate([s.left_poses, s.poses]))
 
     def landmark_covariances(self, rows: IndexArray) -> Array:
         """Covariances (M, 3, 3) in the world of rows of `state.landmarks`."""
@@ -195,8 +191,7 @@ class SmootherBackend:
                 by_rig = s.landmarks.by_rig.copy()
                 by_rig[:, :, -1:] -= (s.landmarks.position - before.landmarks.position)[:, :, None]
                 s = replace(s, landmarks=replace(s.landmarks, by_rig=by_rig))
-            path = self.path.moved(s, s.poses[0] @ inverse(before.poses[0]))
-            self.path, self.state = path, replace(s, measured=True)
+            self.state = replace(s, measured=True)
 
     # --- copies ---
 

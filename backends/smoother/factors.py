@@ -76,9 +76,11 @@ class FactorMaker:
     def motion(self, keys: Sequence[int], dt: Array) -> gtsam.NonlinearFactor:
         """The velocity between the last two poses is that before but for noise: the papers' motion on poses alone.
 
-        gtsam linearises it where it linearises the rest: at other poses it would pull at the path as a whole, which
-        nothing else holds. `keys` are three successive poses with the times `dt` (2,) [s] between them; or two of which
-        the first velocity is unknown, and then the first time does not count.
+        The papers' velocity jumps when an interval begins and then stays: it is the difference of two poses, and a
+        variable for it would only repeat it. gtsam linearises this factor where it linearises the rest: at other poses
+        it would pull at the path as a whole, which nothing else holds. `keys` are three successive poses with the times
+        `dt` (2,) [s] between them; or two of which the first velocity is unknown, and then the first time does not
+        count.
         """
         n, before, last = len(keys), float(dt[0]), float(dt[1])
 

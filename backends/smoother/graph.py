@@ -6,16 +6,19 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import gtsam
 import numpy as np
 
+from backends.smoother import joint
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key
+from backends.smoother.landmarks import by_pose
 from backends.smoother.state import SmootherState
-from backends.smoother.tracks import GraphProblem, Stamps, Tracks
+from backends.smoother.tracks import GraphProblem, Tracks
 from slam.data import IdArray
 from slam.errors import SlamError
-from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array, adjoint, inverse, transform
 
 _ENDLESS = 1e9  # numerics: a lag that no run reaches
 _CAREFUL = 20  # numerics: poses after a failure whose factors are made so that they do not throw
@@ -42,13 +45,21 @@ def solving() -> Iterator[None]:
 class Solved:
     """The last poses as the graph has them."""
 
-    first: int  # number of the first one
+    oldest: int  # number of the first one
     poses: Array  # (L, 4, 4)
-    serials: IdArray  # of landmarks that are variables (V,)
-    points: Array  # and where they are (V, 3)
+    serials: IdArray  # of landmarks that are variables (V,),
+    points: Array  # where they are (V, 3),
     linearised: Array  # and where they are linearised (V, 3)
-    covariance: Array  # joint covariance of the anchor, or the oldest pose, the last but one, and the last (18, 18)
+    joint: Array  # covariance (18, 18) of the last pose, which is the anchor, see `backends.smoother.joint`
+    # By how much (6, 6) the last pose is less certain than the anchor before it: over many frames this adds up to the
+    # path's drift. The covariance of the motion would not, as each frame has an error of its own that the next forgets.
+    drift: Array
     spread: Array  # covariances (N, 6, 6) of those that are new
+
+    def displaced(self, M: Array) -> Solved:
+        """After a displacement M (4, 4) in the world."""
+        points, linearised = transform(M, self.points), transform(M, self.linearised)
+        return replace(self, poses=M @ self.poses, points=points, linearised=linearised)
 
 
 class Graph:
@@ -83,9 +94,9 @@ class Graph:
         )
         self._tracks = Tracks(self._make, self._lag)
         self.number, self._taken = -1, 0
-        self._base: Array = np.zeros((6, 6))  # what is known of the first pose, besides its prior
+        self._base: Array = np.zeros((6, 6))  # covariance of the first pose in the world, besides its prior
         self._poses: dict[int, Array] = {}
-        self._first = np.eye(4)  # the first pose
+        self._start = np.eye(4)  # the first pose
         self._to_state = np.eye(4)  # takes gtsam's coordinates to the state's
         self._kind = False, 0
 
@@ -108,74 +119,85 @@ class Graph:
             s = replace(s, landmarks=s.landmarks.without_variables(s.number))
         return self.rebuilt(s), why
 
-    def rebuilt(self, s: SmootherState, again: int = 0) -> Solved:
-        """The solution with all anew, linearised `again` so many times more; SolverError where gtsam fails."""
+    def rebuilt(self, s: SmootherState, steps: int = 0) -> Solved:
+        """The solution with all anew, after so many `steps` more than usual; SolverError where gtsam fails."""
         self.restart()
         oldest, self._careful = s.oldest(self._lag, s.number), max(self._careful, s.number + 1)
-        self._kind, self._first = _kind(s), s.poses[s.of(oldest)]
-        prior, self._base = held(s, oldest)
-        begin = GraphProblem()
-        begin.factors.add(self._make.prior(oldest, s.start if oldest == s.begun else self._first, prior))
-        return self._update(s, range(oldest, s.number + 1), begin, again)
+        self._kind, self._start = _kind(s), s.poses[s.of(oldest)]
+        prior, self._base = first_prior(s, oldest)
+        problem = GraphProblem()
+        problem.factors.add(self._make.prior(oldest, s.start if oldest == s.begun else self._start, prior))
+        return self._update(s, range(oldest, s.number + 1), problem, steps)
 
     def displaced(self, M: Array) -> None:
         """Follow a displacement M (4, 4) of all that the state has in the world: what is in it is relative."""
-        self._to_state, self._first = M @ self._to_state, M @ self._first
+        self._to_state, self._start = M @ self._to_state, M @ self._start
         self._poses = {number: M @ T for number, T in self._poses.items()}
 
-    def _update(self, s: SmootherState, numbers: range, problem: GraphProblem, again: int = 0) -> Solved:
-        """The solution after a problem, and some poses with what was measured from them; solved `again` so often."""
-        oldest, before = s.oldest(self._lag, s.number), numbers.start - 1
-        first = min(oldest, before) if self._poses else oldest  # more than a lag of poses may have seen nothing
+    def _update(self, s: SmootherState, numbers: range, problem: GraphProblem, steps: int = 0) -> Solved:
+        """The solution with what is in a problem, and poses of some numbers with what was measured from them."""
+        oldest = s.oldest(self._lag, s.number)
+        # until this update is done; since the last one more than a lag of poses may have come
+        begin = min(oldest, numbers.start - 1) if self._poses else oldest
         for number in numbers:
-            if number > first:
-                self._tracks.add_rows(problem, s, number - 1, first, self._taken)
-            self._tracks.add_pose(problem, s, number, first)
-            self._tracks.add_rows(problem, s, number, first)
+            if number > begin:
+                self._tracks.add_rows(problem, s, number - 1, begin, self._taken)
+            self._tracks.add_pose(problem, s, number, begin)
+            self._tracks.add_rows(problem, s, number, begin)
             self._taken = len(s.sights[s.of(number)])
         kept = self._tracks.keep(problem, s)
         made = self._tracks.make_smart(problem, s.number < self._careful)
-        # Two steps of Gauss and Newton. gtsam's clock is the newest stamp: in the first step it stands, so nothing
-        # leaves. What leaves fixes where its neighbours stay linearised, and that is to be after the newest pose is
-        # solved for.
-        now: Stamps = dict.fromkeys(problem.values.keys(), float(s.ages[s.of(numbers.start)] - 1))
+        # Two steps of Gauss and Newton. What leaves the lag fixes where its neighbours stay linearised, and that is to
+        # be where they are once the newest pose is solved for. gtsam's clock is the latest time of a variable: in the
+        # first step all that is new has the time of the last update, so that nothing leaves.
+        now: dict[Any, Any] = dict.fromkeys(problem.values.keys(), float(s.ages[s.of(numbers.start)] - 1))
         with solving():
             self._solver.update(problem.factors, problem.values, now, problem.removed)
             slots = self._solver.getISAM2Result().getNewFactorsIndices()
-            for _ in range(again):
+            for _ in range(steps):
                 self._solver.update()
-            self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.stamps)
+            self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.ages)
             values = self._solver.calculateEstimate()
         for track, place in made:
             track.slot = slots[place]
         self._tracks.forget(s, oldest)
         new = [i for i in numbers if i >= oldest] if self._poses else [s.number]
+        return self._solution(s, oldest, new, kept, values)
+
+    def _solution(self, s: SmootherState, oldest: int, new: list[int], kept: list[int], values: gtsam.Values) -> Solved:
+        """What gtsam found, in the state's coordinates: `new` poses, and variables of landmarks that are `kept`."""
         poses = self._to_state @ [values.atPose3(pose_key(i)).matrix() for i in range(oldest, s.number + 1)]
         self._poses = dict(zip(range(oldest, s.number + 1), poses))
         points, linearised = (
             transform(self._to_state, np.array([v.atPoint3(landmark_key(n)) for n in kept]).reshape(-1, 3))
             for v in (values, self._solver.getLinearizationPoint() if kept else values)
         )
-        joint = self._joint([max(oldest, i) for i in (s.anchor, s.number - 1, s.number)])
-        spread = np.array([*(self._joint([i]) for i in new[:-1]), joint[-6:, -6:]])
-        if not (np.isfinite(poses).all() and np.isfinite(joint).all() and (np.diag(joint) > 0).all()):
+        at = [max(oldest, i) for i in (s.anchor, s.number - 1, s.number)]
+        P = self._relative(at)
+        if not (np.isfinite(poses).all() and np.isfinite(P).all() and (np.diag(P) > 0).all()):
             raise SolverError("gtsam: the solution is not finite, or a variance not positive")
+        spread = np.array([*(self._covariance([i]) for i in new[:-1]), (P + self._rigid(at))[12:, 12:]])
+        anchor, before, newest = poses[np.array(at) - oldest]
+        shared = joint.anchored(P, np.zeros((6, 6)), np.array([before, newest]))
+        shared[:6, :6] = spread[-1]
+        A = adjoint(inverse(newest) @ anchor)
+        drift = joint.root(P[12:, 12:] - A @ P[:6, :6] @ A.T)
         self.number = s.number
-        return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, joint, spread)
+        return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, shared, drift @ drift.T, spread)
 
-    def joint_covariance(self, s: SmootherState, first: int, last: int) -> tuple[int, Array]:
-        """Number of the first pose, and the joint covariance (6 K, 6 K) of the poses from there to the `last`.
+    def joint_covariance(self, s: SmootherState, first: int) -> tuple[int, Array]:
+        """Number of the first pose, and the joint covariance (6 K, 6 K) of the poses from there to the newest.
 
-        From `first` on, or the oldest in the graph; of the last pose alone, if the graph is not the state's. Poses that
-        nothing was measured from since follow from the motion model.
+        It begins at `first`, or at the oldest pose in the graph; where the graph is not the state's, at the newest.
+        Poses that are not in the graph yet follow from the motion model.
         """
         if not self._is_of(s):
-            return last, s.spread[s.of(last)]
-        oldest, solved = s.oldest(self._lag, self.number), self.number
+            return s.number, s.spread[-1]
+        oldest = s.oldest(self._lag, self.number)
         first = max(oldest, first)
-        begin = max(oldest, min(first, solved - 1))  # where the motion goes on, it needs two poses
-        P = self._joint(list(range(begin, min(solved, last) + 1)))
-        for number in range(solved + 1, last + 1):
+        begin = max(oldest, min(first, self.number - 1))  # where the motion goes on, it needs two poses
+        P = self._covariance(list(range(begin, self.number + 1)))
+        for number in range(self.number + 1, s.number + 1):
             _, J, noise, _ = s.moved(self._make.models, number)
             J = J[:, -len(P) :]
             cross = J @ P[-J.shape[1] :]
@@ -183,7 +205,7 @@ class Graph:
             P = np.block([[P, cross.T], [cross, 0.5 * (own + own.T)]])  # what is not symmetric would grow fourfold
             gain = np.linalg.solve(P[-6:, -6:], P[-6:])  # a pose that was solved for alone is known better
             P = P + gain.T @ (s.spread[s.of(number)] - P[-6:, -6:]) @ gain
-        rows = slice(6 * (first - begin), 6 * (last + 1 - begin))
+        rows = slice(6 * (first - begin), None)
         return first, P[rows, rows]
 
     def landmark_covariance(self, s: SmootherState, serial: int, position: Array) -> Array | None:
@@ -191,48 +213,51 @@ class Graph:
         key = landmark_key(serial)
         if not self._is_of(s) or not self._solver.getLinearizationPoint().exists(key):
             return None
-        J = by_pose(self._first, position)
-        R = self._to_state[:3, :3]
+        J, R = by_pose(self._start, position[None])[0], self._to_state[:3, :3]
         return np.asarray(R @ self._solver.getISAM2().marginalCovariance(key) @ R.T + J @ self._base @ J.T)
 
     def _is_of(self, s: SmootherState) -> bool:
         """Whether it is the state's graph, up to poses since the last update; not if that was interrupted."""
         return self.number == s.solved >= max(s.begun, s.first) and self._kind == _kind(s)
 
-    def _joint(self, numbers: list[int]) -> Array:
+    def _covariance(self, numbers: list[int]) -> Array:
+        """Joint covariance (6 K, 6 K) in the world of poses."""
+        return self._relative(numbers) + self._rigid(numbers)
+
+    def _rigid(self, numbers: list[int]) -> Array:
+        """What is known of the first pose in the world as a joint covariance (6 K, 6 K) of poses."""
+        A = adjoint(inverse(np.array([self._poses[i] for i in numbers])) @ self._start).reshape(-1, 6)
+        return np.asarray(A @ self._base @ A.T)
+
+    def _relative(self, numbers: list[int]) -> Array:
+        """Joint covariance (6 K, 6 K) of poses, besides what is known of the first one in the world."""
         each, at = np.unique(numbers, return_inverse=True)
         keys = [pose_key(i) for i in each.tolist()]
         with solving():
             isam = self._solver.getISAM2()
             P = isam.marginalCovariance(keys[0]) if len(keys) == 1 else isam.jointMarginalCovariance(keys).fullMatrix()
-        again = (6 * at[:, None] + np.arange(6)).ravel()
-        A = adjoint(inverse(np.array([self._poses[i] for i in numbers])) @ self._first).reshape(-1, 6)
-        P = P[again[:, None], again] + A @ self._base @ A.T
+        rows = (6 * at[:, None] + np.arange(6)).ravel()
+        P = P[rows[:, None], rows]
         return np.asarray(0.5 * (P + P.T))
 
 
 def _kind(s: SmootherState) -> tuple[bool, int]:
     """What a graph is built for: whether landmarks are known in the world, and which revision of the measurements."""
-    return s.anchored, s.revisions
+    return s.fixed, s.revisions
 
 
-def held(s: SmootherState, number: int) -> tuple[Array, Array]:
-    """Covariance of the prior of a pose that comes first (6, 6), and what is known of it in the world besides.
+def first_prior(s: SmootherState, number: int) -> tuple[Array, Array]:
+    """Covariance of the prior of a pose that comes first (6, 6), and its covariance in the world besides.
 
     What was measured from the pose with which the problem begins is in the graph, and not in its prior. Of a later one
-    it is in both: what known landmarks told of it is not told again, see `Tracks`.
+    it is in both; but what known landmarks told of it is not told again, see `Tracks`.
     """
     P = s.prior if number == s.begun else s.spread[s.of(number)]
-    if s.anchored:
+    if s.fixed:
         return P, np.zeros((6, 6))
     prior = np.diag(np.minimum(np.diag(P), _FIRM))
-    values, vectors = np.linalg.eigh(P - prior)
-    return prior, (vectors * values.clip(min=0)) @ vectors.T
-
-
-def by_pose(T: Array, position: Array) -> Array:
-    """Derivatives (3, 6) of a point (3,) in the world that is fixed to a pose T (4, 4)."""
-    return np.asarray(T[:3, :3] @ points_by_pose(transform(inverse(T), position[None]))[0])
+    base = joint.root(P - prior)
+    return prior, base @ base.T
 
 
 def minimised(problem: GraphProblem, iterations: int) -> gtsam.Values:

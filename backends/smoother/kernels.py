@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import assign, invert_symmetric, multiply, trace
+from slam.kernels.linear import assign, invert_symmetric, trace
 from slam.kernels.se3 import transform_back
 from slam.kernels.stereo import by_point, residual
 from slam.kernels.velocities import velocity_change
@@ -98,44 +98,6 @@ def refine(camera, poses, frames, z, sigma, mean, information, points, own):
             for i in range(3):
                 x[i] = points[m, i] + step[i]
         invert_symmetric(H, _FREE * (1 + trace(H)), own[m])
-
-
-@kernel
-def carried_by(camera, poses, width, frames, z, sigma, points, older, own):
-    """How the last poses carry landmarks along: Jacobians (M, 3, 6 width) by the last `width` of the poses.
-
-    The other arguments are as in `refine`. Measurements from earlier poses, and what is known besides them, `older`
-    (M, 3, 3), count for the oldest of these poses that measured the landmark.
-    """
-    first, weight = len(poses) - width, 1 / (sigma * sigma)
-    out, share = np.zeros((len(points), 3, 6 * width)), np.empty((width, 3, 3))
-    d, g, C, D, work = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((6, 3))
-    for m in range(len(points)):
-        share[:] = 0.0
-        oldest = width - 1
-        for k in range(frames.shape[1]):
-            if frames[m, k] >= 0:
-                place = max(frames[m, k] - first, 0)
-                oldest = min(oldest, place)
-                add_information(camera, poses[frames[m, k]], z[m, k], points[m], weight, share[place], g, work)
-        for i in range(3):
-            for j in range(3):
-                share[oldest, i, j] += older[m, i, j]
-        for w in range(width):
-            T = poses[first + w]
-            multiply(own[m], share[w], C)
-            for i in range(3):
-                d[i] = points[m, i] - T[i, 3]
-            for i in range(3):  # C times the negative cross product matrix of d
-                D[i, 0] = C[i, 2] * d[1] - C[i, 1] * d[2]
-                D[i, 1] = C[i, 0] * d[2] - C[i, 2] * d[0]
-                D[i, 2] = C[i, 1] * d[0] - C[i, 0] * d[1]
-            for i in range(3):
-                for j in range(3):
-                    for h in range(3):
-                        out[m, i, 6 * w + j] += D[i, h] * T[h, j]
-                        out[m, i, 6 * w + 3 + j] += C[i, h] * T[h, j]
-    return out
 
 
 @kernel

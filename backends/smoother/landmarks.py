@@ -14,7 +14,7 @@ from slam.geometry.se3 import Array, points_by_pose
 from slam.window.stereo import RectifiedStereo
 
 RECENT = 12  # so many of its last measurements give a landmark's position and covariance
-VARIABLE = -(10**9)  #: in place of the number of the pose with which a smart factor begins: a variable of the graph
+VARIABLE = -(10**9)  #: in place of `SmootherLandmarks.since`: no smart factor, but a variable of the graph
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,19 +30,19 @@ class SmootherLandmarks(LandmarkRows):
     world: BoolArray  # whether that does not depend on any pose (S,)
     z: Array  # its last measurements (S, RECENT, 3)
     pose: IndexArray  # and the numbers of their poses (S, RECENT), −1 for none
-    # its smart factor, by the number of the pose from which its span counts (S,); or VARIABLE, but not of known ones
-    factor: IndexArray
+    # number of the pose from which the span of its smart factor counts (S,); or VARIABLE, but not of known ones
+    since: IndexArray
     linearised: Array  # where the graph has it linearised, if it is a variable (S, 3) [m]
     by_rig: Array  # derivatives of the positions by errors of the rig (S, 3, m)
 
     @classmethod
     def of(
-        cls, ids: IdArray, first: int, position: Array, own: Array, information: Array, world: bool, by_rig: Array
+        cls, ids: IdArray, serial: int, position: Array, own: Array, information: Array, world: bool, by_rig: Array
     ) -> Self:
-        """Landmarks that are known, but not measured yet; `first` is the first one's serial number."""
+        """Landmarks that are known, but not measured yet; `serial` is the first one's number."""
         n = len(ids)
         return cls(
-            ids, first + np.arange(n), position, own, np.zeros((n, 3, 3)), position, information, np.full(n, world),
+            ids, serial + np.arange(n), position, own, np.zeros((n, 3, 3)), position, information, np.full(n, world),
             np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp), position, by_rig,
         )  # fmt: skip
 
@@ -57,28 +57,25 @@ class SmootherLandmarks(LandmarkRows):
         """Covariances (S, 3, 3) of the positions where the newest pose is known, in world axes."""
         return self.own + self.away
 
-    def measured(
-        self, rows: IndexArray, z: Array, pose: int, track: int, oldest: int = 0, before: int = -1
-    ) -> SmootherLandmarks:
+    def measured(self, rows: IndexArray, z: Array, pose: int, track: int, oldest: int, solved: int) -> Self:
         """With one more measurement (M, 3) of some landmarks, from the pose of a number.
 
         A smart factor spans at most `track` poses. Then, or if a landmark was not measured for half as many, it goes on
         in a new one. If landmarks that were found together all began anew at once, the motion model alone would tie
         that pose to the one before. So the first factor spans fewer, down to half of them, differently for each
-        landmark. After frames that measured nothing many factors end together all the same: then every other one takes
-        this measurement, too, unless its first pose has left the graph, whose newest one is pose `before`.
+        landmark. Where frames that measured nothing come between this pose and the last one that was `solved` for,
+        many factors end at once all the same: of these every other one takes this measurement as well, unless its first
+        pose has left the graph.
 
         What was measured last before pose `oldest` is left out from now on: the camera has drifted. It counts as what
         was known beforehand.
         """
-        last, factor = self.pose[rows].max(axis=1), self.factor.copy()
-        half, full = max(track // 2, 1), factor[rows] <= pose - track
-        anew = (last < 0) | (last < pose - half)
-        held = (
-            (last >= 0) & (0 <= before < pose - 1) & (factor[rows] > before - track) & (self.serial[rows] // 2 % 2 == 0)
-        )
-        smart = np.where(anew, pose - self.serial[rows] % half, np.where(full, pose, factor[rows]))
-        factor[rows] = np.where(held | (factor[rows] == VARIABLE), factor[rows], smart)
+        last, since, half = self.pose[rows].max(axis=1), self.since[rows], max(track // 2, 1)
+        longer = (last >= 0) & (0 <= solved < pose - 1) & (since > solved - track) & (self.serial[rows] // 2 % 2 == 0)
+        anew = np.where(since <= pose - track, pose, since)
+        anew = np.where((last < 0) | (last < pose - half), pose - self.serial[rows] % half, anew)
+        every = self.since.copy()
+        every[rows] = np.where(longer | (since == VARIABLE), since, anew)
         old = np.zeros(len(self), bool)
         old[rows] = (last < oldest) & self.away[rows].any(axis=(1, 2))
         if old.any():
@@ -88,41 +85,40 @@ class SmootherLandmarks(LandmarkRows):
         zs, poses = self.z.copy(), self.pose.copy()
         slot = poses[rows].argmin(axis=1)
         zs[rows, slot], poses[rows, slot] = z, pose
-        return replace(self, z=zs, pose=poses, away=away, factor=factor)
+        return replace(self, z=zs, pose=poses, away=away, since=every)
 
     def with_variables(
-        self, rows: IndexArray, z: Array, pose: int, track: int, most: int, T: Array, linear: float
+        self, rows: IndexArray, z: Array, pose: int, track: int, most: int, T: Array, ratio: float
     ) -> Self:
         """With more landmarks as variables, of those that a pose T (4, 4) is about to measure (M, 3); at most so many.
 
-        None where it measures more: these hold the path well enough as they come and go, at half the cost.
-        These are landmarks whose smart factor is full: as variables they keep what it says of them, as its measurements
-        go over. Variables that were not measured for longer than a factor spans make room, the oldest first.
+        Where it measures more, none becomes one: many landmarks that come and go hold the path well enough, at half the
+        cost. A landmark becomes a variable when its smart factor is full: then it keeps what that says of it, as the
+        measurements go over. Variables that were not measured for longer than a factor spans make room, the oldest
+        first.
 
         gtsam linearises a variable no more once a pose that measured it has left the lag. At an offset δ from there and
-        a distance d a pixel is wrong by f (δ/d)²: less than its noise σ where d > δ `linear`, with ``linear² = f/σ``.
+        a distance d a pixel is wrong by f (δ/d)²: less than its noise σ where d > δ `ratio`, with ``ratio² = f/σ``.
         So a landmark becomes a variable where that holds for its deviation, and goes on in a smart factor where it
         holds no more for its offset. Else landmarks that are known from afar carry the path away as it passes them.
         """
         if len(rows) > most:
             return self
-        last, variable = self.pose.max(axis=1), self.factor == VARIABLE
+        last, variable, since = self.pose.max(axis=1), self.since == VARIABLE, self.since.copy()
         deviation = np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2))
         offset = np.linalg.norm(self.position[rows] - self.linearised[rows], axis=1)
-        apart = linear * np.where(variable[rows], offset, deviation)
+        apart = ratio * np.where(variable[rows], offset, deviation)
         nonlinear = apart >= np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
-        full = ~variable[rows] & (self.factor[rows] <= pose - track) & (last[rows] >= pose - max(track // 2, 1))
+        full = ~variable[rows] & (since[rows] <= pose - track) & (last[rows] >= pose - max(track // 2, 1))
         new = rows[full & ~nonlinear & np.isfinite(z[:, 2])]
         leaving = np.flatnonzero(variable & (last < pose - track))
         leaving = leaving[np.argsort(last[leaving], kind="stable")][: max(int(variable.sum()) + len(new) - most, 0)]
-        factor = self.factor.copy()
-        factor[leaving] = 0
-        factor[rows[variable[rows] & nonlinear]] = 0
         new = np.sort(new)[: most - int(variable.sum()) + len(leaving)]
-        factor[new] = VARIABLE
+        since[leaving] = since[rows[variable[rows] & nonlinear]] = 0
+        since[new] = VARIABLE
         linearised = self.linearised.copy()
         linearised[new] = self.position[new]
-        return replace(self, factor=factor, linearised=linearised)
+        return replace(self, since=since, linearised=linearised)
 
     def solved(self, serials: IdArray, points: Array, linearised: Array) -> Self:
         """With variables (V,), by serial number, at points (V, 3), and where the graph has them linearised (V, 3)."""
@@ -132,15 +128,14 @@ class SmootherLandmarks(LandmarkRows):
 
     def without_variables(self, pose: int) -> Self:
         """With smart factors that begin at pose number `pose` in place of all variables."""
-        return replace(self, factor=np.where(self.factor == VARIABLE, pose, self.factor))
+        return replace(self, since=np.where(self.since == VARIABLE, pose, self.since))
 
     def left_behind(self, rows: IndexArray, T: Array, drift: Array) -> Self:
         """After a pose T (4, 4) that measured only the landmarks `rows`, and is off by a drift (6, 6) from the last."""
         unseen = ~self.world
         unseen[rows] = False
-        by_pose = T[:3, :3] @ points_by_pose((self.position[unseen] - T[:3, 3]) @ T[:3, :3])
-        away = self.away.copy()
-        away[unseen] += by_pose @ drift @ np.swapaxes(by_pose, 1, 2)
+        J, away = by_pose(T, self.position[unseen]), self.away.copy()
+        away[unseen] += J @ drift @ np.swapaxes(J, 1, 2)
         return replace(self, away=away)
 
     def without_measurements(self, chosen: BoolArray) -> Self:
@@ -173,26 +168,28 @@ class SmootherLandmarks(LandmarkRows):
         )
         return replace(self, position=position, own=own)
 
-    def covariances(
-        self, stereo: RectifiedStereo, sigma: float, chosen: IndexArray, first: int, poses: Array, joint: Array
-    ) -> Array:
-        """Covariances (M, 3, 3) in the world of some landmarks, given that of the last poses, `joint` (6 K, 6 K).
+    def covariances(self, chosen: IndexArray, newest: int, poses: Array, spread: Array) -> Array:
+        """Covariances (M, 3, 3) in the world of some landmarks: ``C + J P Jᵀ``.
 
-        With the information ``I_j = E_jᵀE_j`` of each measurement on the landmark, and G_j as how a point moves that is
-        fixed to pose j, ``∂l/∂x_j = (ΣI)⁻¹ I_j G_j``: each pose carries the landmark along by its share of the
-        information. Measurements from earlier poses than these count for the first of them. A landmark that was never
-        measured is carried by the newest, with the drift since it is known. All `poses` (N, 4, 4) are from number
-        `first` on.
+        C is known where all poses are. The landmark moves with the pose that measured it last, of which P was known
+        when it was the newest, by ``J = (1 − C Λ) G``: G as a point that is fixed to the pose, less what is known of it
+        in the world beforehand, Λ. One that was never measured moves with the newest pose, and by the drift since it is
+        known. The last of the `poses` (K, 4, 4), with covariances `spread` (K, 6, 6), is of number `newest`.
         """
-        marks, n, width = self.select(chosen), len(chosen), len(joint)
-        frames = np.where(marks.pose >= 0, (marks.pose - first).clip(0), -1)
-        older = np.where(marks.world[:, None, None], 0.0, marks.information)
-        J = kernels.carried_by(
-            stereo.intrinsics, poses, width // 6, frames, marks.z, sigma, marks.position, older, marks.own
-        )
-        C = marks.own + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
-        C[frames.max(axis=1) < 0] += marks.away[frames.max(axis=1) < 0]
+        marks, last = self.select(chosen), self.pose[chosen].max(axis=1, initial=-1)
+        row = (np.where(last < 0, newest, last) - newest - 1).clip(-len(poses))
+        J = by_pose(poses[row], marks.position)
+        J[marks.world] -= (marks.own @ marks.information @ J)[marks.world]
+        C = marks.own + J @ spread[row] @ np.swapaxes(J, 1, 2)
+        C[last < 0] += marks.away[last < 0]
         return np.asarray(0.5 * (C + np.swapaxes(C, 1, 2)))
+
+
+def by_pose(T: Array, points: Array) -> Array:
+    """Derivatives (M, 3, 6) of points (M, 3) in the world that are fixed to one pose T (4, 4), or to M of them."""
+    R = T[..., :3, :3]
+    local = (np.swapaxes(R, -1, -2) @ (points - T[..., :3, 3])[:, :, None])[:, :, 0]
+    return np.asarray(R @ points_by_pose(local))
 
 
 def inverses(H: Array) -> Array:

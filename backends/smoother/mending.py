@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from backends.smoother.graph import Graph, SolverError
 from backends.smoother.state import SmootherState
-from backends.smoother.steps import Steps
+from backends.smoother.steps import Steps, anchored
 from slam.geometry.se3 import Array, inverse, transform
 from slam.window.stereo import RectifiedStereo
 
@@ -31,22 +30,19 @@ def corrected(s: SmootherState, correct: Callable[[Array], Array]) -> SmootherSt
 
 def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     """The last poses after a correction: the newest one stays where it is, the others and the landmarks move."""
-    first = s.oldest(steps.config.lag, s.number)
-    now, spread, start = s.poses[s.of(first) :], s.spread, s.start
-    with suppress(SolverError):  # then the next update tries again
+    s = anchored(s)
+    marks, oldest = s.landmarks, s.oldest(steps.config.lag, s.number)
+    try:
         solved = graph.rebuilt(s, _AGAIN)
-        now, spread = solved.poses, np.concatenate([spread[:-1], solved.spread[-1:]])
-        if not s.anchored:
-            M = s.poses[-1] @ inverse(now[-1])
-            graph.displaced(M)
-            now = M @ now
-            now[-1] = s.poses[-1]
-            start = M @ start
-    D = now[0] @ inverse(s.poses[s.of(first)])
-    moved = np.concatenate([D @ s.poses[: s.of(first)], now])
-    marks = s.landmarks
-    unseen = ~marks.world & ~(marks.pose >= first).any(axis=1)
+    except SolverError:  # the next update tries again
+        return replace(s, landmarks=marks.refined(steps.stereo, steps.models.pixel_sigma, s.first, s.poses))
+    if not s.fixed:
+        M = s.poses[-1] @ inverse(solved.poses[-1])
+        graph.displaced(M)
+        solved, s = solved.displaced(M), replace(s, start=M @ s.start)
+    D = solved.poses[0] @ inverse(s.poses[s.of(oldest)])
+    unseen = ~marks.world & ~(marks.pose >= oldest).any(axis=1)
     position = np.where(unseen[:, None], transform(D, marks.position), marks.position)
     marks = replace(marks, position=position, mean=np.where(unseen[:, None], position, marks.mean))
-    marks = marks.refined(steps.stereo, steps.models.pixel_sigma, s.first, moved)
-    return replace(s, poses=moved, landmarks=marks, spread=spread, start=start, solved=graph.number)
+    poses = np.concatenate([D @ s.poses[: s.of(oldest)], s.poses[s.of(oldest) :]])
+    return steps.settled(replace(s, poses=poses, left_poses=D @ s.left_poses, landmarks=marks), solved)

@@ -20,18 +20,13 @@ class Sight(Table):
     """What was measured from one pose."""
 
     serials: IdArray  # of the landmarks (M,)
-    factor: IndexArray  # which of each one's smart factors it goes into (M,), see `SmootherLandmarks.factor`
+    since: IndexArray  # which of each one's smart factors it goes into (M,), see `SmootherLandmarks.since`
     z: Array  # measurements (M, 3) of the rectified rig, uR NaN where missing
 
     @classmethod
     def none(cls) -> Sight:
         """Nothing."""
         return cls(np.zeros(0, np.int64), np.zeros(0, np.intp), np.zeros((0, 3)))
-
-    @classmethod
-    def of(cls, marks: SmootherLandmarks, rows: IndexArray, z: Array) -> Sight:
-        """Of measurements z (M, 3) that landmarks have just had."""
-        return cls(marks.serial[rows], marks.factor[rows], z)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +43,8 @@ class Known:
 class SmootherState:
     """The poses of all frames that are kept, by number, and the landmarks.
 
-    A pose from which nothing was measured follows from the motion model alone. The last two poses' covariances, and
-    those of landmarks, are relative to the anchor.
+    A pose from which nothing was measured follows from the motion model alone. Covariances of landmarks are relative to
+    the anchor.
     """
 
     first: int  # number of the first pose that is kept
@@ -60,19 +55,19 @@ class SmootherState:
     ages: IndexArray  # how many poses up to each (K,) gave the graph anything: the lag is counted in these
     sights: tuple[Sight, ...]  # what the graph is given of each
     spread: Array  # covariance in the world of each when it was the newest that was solved for (K, 6, 6)
-    pair: Array  # joint covariance (12, 12) of the errors of the last two poses relative to the anchor
-    shared: Array  # covariance (6, 12) of the anchor's own error in the world with these
+    joint: Array  # covariance (18, 18) of the anchor and the last two poses, see `backends.smoother.joint`
     by_rig: Array  # derivatives of the last two poses' errors by errors of the rig (12, m)
-    # of the pose with which the problem begins, before anything was measured from it: covariance (6, 6), where it was
-    # believed to be (4, 4), and the covariance of its attitude about the world's axes (3, 3) [rad²]
+    # of the pose with which the problem begins, before anything was measured from it: covariance (6, 6), and where it
+    # was believed to be (4, 4)
     prior: Array = field(default_factory=lambda: np.zeros((6, 6)))
     start: Array = field(default_factory=lambda: np.eye(4))
-    turned: Array = field(default_factory=lambda: np.zeros((3, 3)))
     anchor: int = 0  # number of the last pose that gave the graph anything
     solved: int = -1  # number of the newest pose that the graph solved for; −1 for none
     landmarks: SmootherLandmarks = field(default_factory=SmootherLandmarks.none)
     serials: int = 0  # number of landmarks so far
     known: Mapping[int, Known] = field(default_factory=dict)  # by serial number
+    left_stamps: Array = field(default_factory=lambda: np.zeros(0))  # times of poses that are kept no more (N,) [s]
+    left_poses: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # and these, which are final
     measured: bool = False  # whether the newest pose may not be updated any more
     revisions: int = 0  # how often the measurements were revised
     contradicted: int = 0  # updates in succession in which most observations agreed on another pose than expected
@@ -82,8 +77,7 @@ class SmootherState:
         """Before the first prediction; `by_rig` (6, m) is of the first pose."""
         return cls(
             0, 0, np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0, bool), np.zeros(0, np.intp), (), np.zeros((0, 6, 6)),
-            np.zeros((12, 12)), np.zeros((6, 12)), np.tile(by_rig, (2, 1)),
-            landmarks=SmootherLandmarks.none(by_rig.shape[1]),
+            np.zeros((18, 18)), np.tile(by_rig, (2, 1)), landmarks=SmootherLandmarks.none(by_rig.shape[1]),
         )  # fmt: skip
 
     @property
@@ -97,14 +91,21 @@ class SmootherState:
         return self.first + len(self.poses) - 1
 
     @property
-    def anchored(self) -> bool:
-        """Whether landmarks are known in the world: then the path may not be moved in it."""
+    def fixed(self) -> bool:
+        """Whether landmarks are known in the world, so that the path may not be moved in it."""
         return any(known.pose < 0 for known in self.known.values())
 
     @property
-    def own(self) -> Array:
+    def relative(self) -> Array:
         """Covariance (6, 6) of the newest pose's error relative to the anchor."""
-        return self.pair[6:, 6:]
+        return self.joint[12:, 12:]
+
+    @property
+    def gain(self) -> Array:
+        """By how much (6, 6) the last but one pose's error relative to the anchor follows the newest one's."""
+        if self.number == self.begun:
+            return np.zeros((6, 6))
+        return np.asarray(np.linalg.solve(self.relative, self.joint[12:, 6:12]).T)
 
     def intervals(self, number: int) -> tuple[float, float | None]:
         """Time [s] from the pose before to a pose, and from the one before that; None where there is none."""
@@ -135,6 +136,8 @@ class SmootherState:
         return replace(
             self, first=self.first + gone, poses=self.poses[gone:], stamps=self.stamps[gone:], rests=self.rests[gone:],
             ages=self.ages[gone:], sights=self.sights[gone:], spread=self.spread[gone:],
+            left_stamps=np.append(self.left_stamps, self.stamps[:gone]),
+            left_poses=np.concatenate([self.left_poses, self.poses[:gone]]),
             landmarks=self.landmarks.folded(self.first + gone, oldest),
             known={k: one for k, one in self.known.items() if not 0 <= one.pose < self.first + gone},
         )  # fmt: skip

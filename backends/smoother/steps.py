@@ -1,8 +1,4 @@
-"""The steps of the smoother: functions from a state to the next.
-
-Errors of the rig are considered, not estimated (Schmidt, 1966). The pose follows from the landmarks as they stand, and
-each landmark from its measurements given the poses: these gains move the derivatives by the errors, too.
-"""
+"""The steps of the smoother: functions from a state to the next."""
 
 from __future__ import annotations
 
@@ -11,22 +7,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from backends.smoother import joint
 from backends.smoother.config import SmootherConfig
 from backends.smoother.graph import Graph, Solved, SolverError
 from backends.smoother.landmarks import VARIABLE, SmootherLandmarks, inverses
+from backends.smoother.rig import considered
 from backends.smoother.state import Known, Sight, SmootherState
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, points_by_pose, transform
-from slam.window import pose_only
+from slam.window import pose_only, solver
 from slam.window.consensus import landmarks_pose
 from slam.window.gating import MIN_CONSENSUS
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
-from slam.window.stereo import RectifiedMeasurement, relative_covariance
+from slam.window.stereo import RectifiedMeasurement
 
 _DARK = 100  # frames without a measurement after which the problem begins anew: they would be poses of the graph
-_PART = 64  # cost: poses whose joint covariance is wanted at once, and as many before them
 _SAME = 0.5  # share of a pose's landmarks that another one must measure to say nothing new
-_ALONE: tuple[Array, Array] = np.zeros((12, 12)), np.zeros((6, 12))  # `pair` and `shared` of a first pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,17 +51,12 @@ class Steps(RectifiedMeasurement):
             sigmas = np.repeat([self.models.initial_rotation_sigma, self.models.initial_position_sigma], 3)
             P: Array = np.diag(sigmas**2)
             return _begun(replace(s, poses=T[None], spread=P[None], ages=np.zeros(1, np.intp)), T, P)
-        s = replace(s, poses=np.concatenate([s.poses, s.poses[-1:]]), ages=np.append(s.ages, s.ages[-1]))
-        T, J, noise, _ = s.moved(self.models, s.number)
-        cross = J @ s.pair[:, 6:]
-        own = _carried(J, s.pair) + noise
-        own = 0.5 * (own + own.T)
-        shared = s.shared @ J.T
-        P = _in_world(s, T, shared, own)
+        T, J, noise, _ = s.moved(self.models, s.number + 1)
+        P = joint.moved(s.joint, J, noise)
+        spread = joint.in_world(P, s.poses[s.of(s.anchor)], T)
         return replace(
-            s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread, P[None]]),
-            pair=np.block([[s.own, cross.T], [cross, own]]), shared=np.concatenate([s.shared[:, 6:], shared], axis=1),
-            by_rig=np.concatenate([s.by_rig[6:], J @ s.by_rig]),
+            s, poses=np.concatenate([s.poses, T[None]]), ages=np.append(s.ages, s.ages[-1]), joint=P,
+            spread=np.concatenate([s.spread, spread[None]]), by_rig=np.concatenate([s.by_rig[6:], J @ s.by_rig]),
         )  # fmt: skip
 
     def in_view(self, s: SmootherState) -> tuple[IndexArray, Array, Array, Array]:
@@ -74,7 +65,7 @@ class Steps(RectifiedMeasurement):
         rows = rows[self.visible(T, marks.position[rows])]
         local, own = pose_only.seen_from(T, marks.position[rows], marks.from_newest[rows])
         by_pose = points_by_pose(local)
-        by_motion = np.where(marks.world[rows, None, None], s.spread[-1], s.own)
+        by_motion = np.where(marks.world[rows, None, None], s.spread[-1], s.relative)
         C = own + by_pose @ by_motion @ np.swapaxes(by_pose, 1, 2)
         return rows, *self.pixels(local, C)
 
@@ -90,8 +81,8 @@ class Steps(RectifiedMeasurement):
         try:
             one = self._problem(s, rows, z)
             at, start = s.of(s.anchor), one.predicted if guess is None else guess
-            R = s.poses[at, :3, :3]
-            lost = len(s.sights[at]) >= MIN_CONSENSUS and unknown_turn(R @ s.spread[at, :3, :3] @ R.T - s.turned)
+            turned = _attitude(s.poses[at], s.spread[at]) - _attitude(s.start, s.prior)  # since the problem began
+            lost = len(s.sights[at]) >= MIN_CONSENSUS and unknown_turn(turned)
             found = agreement(
                 one, start, lambda: landmarks_pose(self, one.points, z, one.predicted, s.number), s.contradicted, lost
             )
@@ -110,7 +101,7 @@ class Steps(RectifiedMeasurement):
         T, marks = s.poses[-1], s.landmarks
         local, own = pose_only.seen_from(T, marks.position[rows], marks.from_newest[rows])
         noise = pose_only.residual_noise(self.stereo, self.models.pixel_sigma, local, own, z)
-        P = s.spread[-1] if s.anchor == s.number or marks.world[rows].any() else s.own
+        P = s.spread[-1] if s.anchor == s.number or marks.world[rows].any() else s.relative
         probability = self.models.gate_probability
         return pose_only.PoseProblem(self.stereo, marks.position[rows], z, noise, T, np.linalg.inv(P), probability)
 
@@ -123,42 +114,43 @@ class Steps(RectifiedMeasurement):
         if found.jump is not None:
             return self._anew(s, graph, found.T, world_covariance(s.spread[-1]), seen, z[used])
         one = replace(one, points=one.points[used], z=z[used], noise=one.noise[used])
-        field, before = self.field(one.z), marks.by_rig[seen]
-        G, F = _by_pose_and_rig(one, found.T, before, field)
         x = log(inverse(one.predicted) @ found.T)
         nis = float(one.distances(found.T).sum() + x @ one.information @ x)
-        by_rig = np.linalg.solve(one.information + G.T @ G, one.information @ s.by_rig[6:] + G.T @ F)
-        marks = replace(marks, by_rig=marks.by_rig.copy())
-        own = marks.from_newest[seen]
-        marks.by_rig[seen] = _landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
-        told = np.linalg.eigvals(np.linalg.solve(one.information, G.T @ G)).real.min()  # over what the motion tells
-        if self.config.poses == "seen" and told > 1 and self._saw_the_same(s, marks.serial[seen]):
-            return _alone(s, found.T, G.T @ G, by_rig), nis, ""
-        linear = math.sqrt(self.stereo.f / self.models.pixel_sigma)
-        marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T, linear)
-        marks = marks.measured(seen, z[used], number, self.track, s.oldest(self.config.lag, number), graph.number)
-        before_by_rig = s.by_rig[:6]
-        if number > s.begun:
-            before_by_rig = before_by_rig + s.pair[:6, 6:] @ np.linalg.solve(s.own, by_rig - s.by_rig[6:])
-        after = replace(
-            _seeing(s), sights=(*s.sights[:-1], Sight.of(marks, seen, z[used])), landmarks=marks,
-            poses=np.concatenate([s.poses[:-1], found.T[None]]),
-            by_rig=np.concatenate([before_by_rig, by_rig]),
-        )  # fmt: skip
+        s = self._considered(s, one, found.T, seen)
+        if self.config.poses == "seen" and self._saw_the_same(s, marks.serial[seen]):
+            H = np.tril(solver.linearised(one.window(found.T)).H)
+            information = H + np.tril(H, -1).T - one.information
+            if np.linalg.eigvals(np.linalg.solve(one.information, information)).real.min() > 1:  # more than the motion
+                return _alone(s, found.T, information), nis, ""
+        ratio = math.sqrt(self.stereo.f / self.models.pixel_sigma)
+        marks = s.landmarks.with_variables(seen, one.z, number, self.track, self.config.landmarks, found.T, ratio)
+        after = replace(_seeing(s), landmarks=marks, poses=np.concatenate([s.poses[:-1], found.T[None]]))
+        after = self._measured(after, seen, one.z, s.oldest(self.config.lag, number))
         solved, why = graph.followed(after)
-        drift = _drift(s, solved)
         after = self.settled(after, solved)
         marks = after.landmarks.without_variables(number) if why else after.landmarks
-        return replace(after, landmarks=marks.left_behind(seen, after.poses[-1], drift)), nis, why
+        return replace(after, landmarks=marks.left_behind(seen, after.poses[-1], solved.drift)), nis, why
+
+    def _considered(self, s: SmootherState, one: pose_only.PoseProblem, T: Array, seen: IndexArray) -> SmootherState:
+        """With derivatives by errors of the rig after measurements, which put the newest pose at T (4, 4)."""
+        marks, sigma = s.landmarks, self.models.pixel_sigma
+        own, by_rig = marks.from_newest[seen], marks.by_rig.copy()
+        pose, by_rig[seen] = considered(one, T, s.by_rig[6:], by_rig[seen], self.field(one.z), own, sigma)
+        before = s.by_rig[:6] + s.gain @ (pose - s.by_rig[6:])
+        return replace(s, by_rig=np.concatenate([before, pose]), landmarks=replace(marks, by_rig=by_rig))
 
     def _anew(
         self, s: SmootherState, graph: Graph, T: Array, P: Array, seen: IndexArray, z: Array
     ) -> tuple[SmootherState, float, str]:
         """As `_corrected`, with the newest pose, at T (4, 4) with a covariance P (6, 6), as the first of a problem."""
-        s = _begun(_seeing(s), T, P)
-        marks = s.landmarks.measured(seen, z, s.number, self.track)
-        s = replace(s, sights=(*s.sights[:-1], Sight.of(marks, seen, z)), landmarks=marks)
+        s = self._measured(_begun(_seeing(s), T, P), seen, z, s.number)
         return self.settled(s, graph.rebuilt(s)), float("nan"), ""
+
+    def _measured(self, s: SmootherState, rows: IndexArray, z: Array, oldest: int) -> SmootherState:
+        """With measurements z (M, 3) of landmarks from the newest pose; see `SmootherLandmarks.measured`."""
+        marks = s.landmarks.measured(rows, z, s.number, self.track, oldest, s.solved)
+        sight = s.sights[-1].joined(Sight(marks.serial[rows], marks.since[rows], z))
+        return replace(s, landmarks=marks, sights=(*s.sights[:-1], sight))
 
     def _saw_the_same(self, s: SmootherState, serials: IdArray) -> bool:
         """Whether the newest pose measured at least half of what the last one in the graph did, not long ago."""
@@ -168,18 +160,14 @@ class Steps(RectifiedMeasurement):
 
     def settled(self, s: SmootherState, solved: Solved) -> SmootherState:
         """The state with what the graph says: the newest pose is the anchor."""
-        poses = np.concatenate([s.poses[: s.of(solved.first)], solved.poses])
-        pair, shared = _ALONE
-        if s.number > s.begun:
-            pair, shared = _before(np.roll(solved.covariance[6:, 6:], 6, (0, 1)), poses[-2:])
+        poses = np.concatenate([s.poses[: s.of(solved.oldest)], solved.poses])
         spread = np.concatenate([s.spread[: -len(solved.spread)], solved.spread])
         marks = s.landmarks.refined(self.stereo, self.models.pixel_sigma, s.first, poses)
         marks = marks.solved(solved.serials, solved.points, solved.linearised)
         known = {n: s.known[n] for n in s.sights[-1].serials.tolist() if n in s.known and s.known[n].used < 0}
         used = {n: replace(one, used=s.number) for n, one in known.items()}
         s = replace(
-            s, poses=poses, pair=pair, shared=shared, spread=spread, landmarks=marks,
-            anchor=s.number, solved=s.number,
+            s, poses=poses, joint=solved.joint, spread=spread, landmarks=marks, anchor=s.number, solved=s.number,
             known={**s.known, **used} if used else s.known,
         )  # fmt: skip
         lag = self.config.lag
@@ -194,11 +182,10 @@ class Steps(RectifiedMeasurement):
         Raises MeasurementError where one is in the map already, or has no right pixel or no positive depth.
         """
         s.landmarks.require_new(ids)
-        s = _anchored(s)
-        marks, new = _seen_from_newest(s, ids, *self.first_sight(ids, z)), np.arange(len(ids))
-        marks = replace(marks, information=np.zeros_like(marks.information)).measured(new, z, s.number, self.track)
-        s = replace(s, sights=(*s.sights[:-1], s.sights[-1].joined(Sight.of(marks, new, z))))
-        return _with(s, marks)
+        s, rows = anchored(s), len(s.landmarks) + np.arange(len(ids))
+        marks = _seen_from_newest(s, ids, *self.first_sight(ids, z))
+        s = _with(s, replace(marks, information=np.zeros_like(marks.information)))
+        return self._measured(s, rows, z, 0)
 
     def inserted(self, s: SmootherState, ids: IdArray, positions: Array, covariances: Array) -> SmootherState:
         """With landmarks known in the world; see `slam.interfaces.MapBackend.insert`."""
@@ -209,7 +196,7 @@ class Steps(RectifiedMeasurement):
 
     def placed(self, s: SmootherState, ids: IdArray, local: Array, covariances: Array) -> SmootherState:
         """With landmarks known in the newest camera's coordinates; see `slam.interfaces.MapBackend.place`."""
-        s = _anchored(s)
+        s = anchored(s)
         marks = _seen_from_newest(s, ids, local, covariances, np.zeros((len(ids), 3, s.by_rig.shape[1])))
         known = {n: Known(x, P, s.number) for n, x, P in zip(marks.serial.tolist(), local, covariances)}
         return replace(_with(s, marks), known={**s.known, **known})
@@ -224,22 +211,18 @@ class Steps(RectifiedMeasurement):
         return replace(s, landmarks=s.landmarks.select(keep))
 
     def landmark_covariances(self, s: SmootherState, graph: Graph, rows: IndexArray) -> Array:
-        """Covariances (M, 3, 3) of landmarks in the world.
-
-        A landmark is carried by the poses that measured it last: of a long path a part at a time is enough.
-        """
-        marks, last = s.landmarks, max(s.anchor, s.solved)
-        newest, oldest = marks.pose[rows].max(axis=1, initial=-1), s.oldest(self.config.lag, s.number)
-        C, newest = np.zeros((len(rows), 3, 3)), np.where(newest < 0, last, newest).clip(oldest, last)
-        for begin in range(oldest, last + 1, _PART):
-            here, end = np.flatnonzero((newest >= begin) & (newest < begin + _PART)), min(begin + _PART - 1, last)
-            if len(here):
-                joint, poses = graph.joint_covariance(s, begin - _PART, end)[1], s.poses[: s.of(end) + 1]
-                C[here] = marks.covariances(self.stereo, self.models.pixel_sigma, rows[here], s.first, poses, joint)
-        for i in np.flatnonzero(marks.factor[rows] == VARIABLE):
+        """Covariances (M, 3, 3) of landmarks in the world."""
+        marks, end = s.landmarks, s.of(s.anchor) + 1
+        C = marks.covariances(rows, s.anchor, s.poses[:end], s.spread[:end])
+        for i in np.flatnonzero(marks.since[rows] == VARIABLE):
             found = graph.landmark_covariance(s, int(marks.serial[rows[i]]), marks.position[rows[i]])
             C[i] = C[i] if found is None else found
         return C
+
+
+def _attitude(T: Array, P: Array) -> Array:
+    """Covariance (3, 3) about the world's axes of the attitude of a pose T (4, 4) with a covariance P (6, 6) [rad²]."""
+    return np.asarray(T[:3, :3] @ P[:3, :3] @ T[:3, :3].T)
 
 
 def _begun(s: SmootherState, T: Array, P: Array) -> SmootherState:
@@ -247,46 +230,29 @@ def _begun(s: SmootherState, T: Array, P: Array) -> SmootherState:
 
     Landmarks go on as they stand; what they were measured from is no part of it.
     """
-    pair, shared = _ALONE
     return replace(
         s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread[:-1], P[None]]),
-        pair=pair, shared=shared, prior=P, start=T, turned=T[:3, :3] @ P[:3, :3] @ T[:3, :3].T,
-        begun=s.number, anchor=s.number, landmarks=s.landmarks.without_measurements(np.ones(len(s.landmarks), bool)),
+        joint=joint.alone(P), prior=P, start=T, begun=s.number, anchor=s.number,
+        landmarks=s.landmarks.without_measurements(np.ones(len(s.landmarks), bool)),
         known={serial: one for serial, one in s.known.items() if one.pose < 0},
     )  # fmt: skip
 
 
-def _in_world(s: SmootherState, T: Array, shared: Array, own: Array) -> Array:
-    """Covariance (6, 6) in the world of a pose T (4, 4) with a covariance `own` relative to the anchor.
-
-    `shared` (6, 6) is that of the anchor's own error with it: a pose that moves on as the last ones did is off by that.
-    """
-    at = s.of(s.anchor)
-    A = np.concatenate([adjoint(inverse(T) @ s.poses[at]), np.eye(6)], axis=1)
-    P = _carried(A, np.block([[s.spread[at], shared], [shared.T, own]]))
-    return 0.5 * (P + P.T)
-
-
-def _alone(s: SmootherState, T: Array, information: Array, by_rig: Array) -> SmootherState:
+def _alone(s: SmootherState, T: Array, information: Array) -> SmootherState:
     """With the newest pose at T (4, 4), by measurements with an information (6, 6) that the graph is not given.
 
-    Its derivatives by errors of the rig are `by_rig` (6, m). The next poses are not known better by it: their
-    measurements would be taken for independent of these, though the landmarks' errors are the same.
+    The next poses are not known better by it: their measurements would be taken for independent of these, though the
+    landmarks' errors are the same.
     """
-    before = np.linalg.inv(s.own)
+    before = np.linalg.inv(s.relative)
     less = before - before @ np.linalg.inv(before + information) @ before
-    gain = s.pair[:6, 6:] @ before
-    earlier = s.poses[-2] @ exp(gain @ log(inverse(s.poses[-1]) @ T))
-    own, shared = (P - P @ less @ s.own for P in (s.own, s.shared[:, 6:]))
-    P = _in_world(s, T, shared, 0.5 * (own + own.T))
-    return replace(
-        s, poses=np.concatenate([s.poses[:-2], earlier[None], T[None]]),
-        spread=np.concatenate([s.spread[:-1], P[None]]),
-        by_rig=np.concatenate([s.by_rig[:6] + gain @ (by_rig - s.by_rig[6:]), by_rig]),
-    )  # fmt: skip
+    earlier = s.poses[-2] @ exp(s.gain @ log(inverse(s.poses[-1]) @ T))
+    P = joint.in_world(s.joint - s.joint[:, 12:] @ less @ s.joint[12:], s.poses[s.of(s.anchor)], T)
+    poses = np.concatenate([s.poses[:-2], earlier[None], T[None]])
+    return replace(s, poses=poses, spread=np.concatenate([s.spread[:-1], P[None]]))
 
 
-def _anchored(s: SmootherState) -> SmootherState:
+def anchored(s: SmootherState) -> SmootherState:
     """With the newest pose as the anchor, where it is predicted if nothing was measured.
 
     Nothing but the motion ties it to the last: where it may have turned anyhow, the problem begins anew.
@@ -294,13 +260,10 @@ def _anchored(s: SmootherState) -> SmootherState:
     if s.anchor == s.number:
         return s
     s = _left_behind(s)
-    if unknown_turn(s.own):
+    if unknown_turn(s.relative):
         return _begun(s, s.poses[-1], s.spread[-1])
-    pair, shared = _before(np.roll(s.pair, 6, (0, 1)), s.poses[-2:])
-    at = s.poses[s.of(s.anchor)]
-    A, B = (adjoint(inverse(T) @ one) for T, one in ((s.poses[-1], at), (s.poses[-2], s.poses[-1])))
-    shared[:, :6] += A @ (s.shared[:, :6] - s.shared[:, 6:] @ B.T)
-    return replace(s, pair=pair, shared=shared, anchor=s.number)
+    by_anchor = adjoint(inverse(s.poses[-1]) @ s.poses[s.of(s.anchor)])
+    return replace(s, joint=joint.anchored(s.joint, by_anchor, s.poses[-2:]), anchor=s.number)
 
 
 def _without_dark(s: SmootherState) -> SmootherState:
@@ -315,64 +278,12 @@ def _without_dark(s: SmootherState) -> SmootherState:
 
 def _left_behind(s: SmootherState) -> SmootherState:
     """With the newest pose as one that saw something, and landmarks relative to it though it measured none."""
-    return replace(_seeing(s), landmarks=s.landmarks.left_behind(np.zeros(0, np.intp), s.poses[-1], s.own))
+    return replace(_seeing(s), landmarks=s.landmarks.left_behind(np.zeros(0, np.intp), s.poses[-1], s.relative))
 
 
 def _seeing(s: SmootherState) -> SmootherState:
     """With the newest pose as one that saw something."""
     return replace(s, ages=np.append(s.ages[:-1], s.ages[-2:][0] + 1))
-
-
-def _before(P: Array, poses: Array) -> tuple[Array, Array]:
-    """`SmootherState.pair` and `shared` where the newest pose is the anchor.
-
-    P (12, 12) is the joint covariance of that and of the pose before; `poses` (2, 4, 4) is that before, and the newest.
-    """
-    before, newest = poses
-    pair, shared = np.zeros((12, 12)), np.zeros((6, 12))
-    pair[:6, :6] = relative_covariance(P, newest, before)
-    shared[:, :6] = P[:6, 6:] - P[:6, :6] @ adjoint(inverse(before) @ newest).T
-    return pair, shared
-
-
-def _by_pose_and_rig(one: pose_only.PoseProblem, T: Array, by_rig: Array, field: Array) -> tuple[Array, Array]:
-    """Derivatives of whitened residuals by a pose T (3 M, 6), and by errors of the rig where it is known (3 M, m).
-
-    The errors move the landmarks in the world by `by_rig` (M, 3, m), and measurements by `field` (M, 3, m).
-    """
-    local = (one.points - T[:3, 3]) @ T[:3, :3]
-    D = one.whiteners @ one.stereo.project(local)[1]
-    F = one.whiteners @ np.nan_to_num(field) - D @ T[:3, :3].T @ by_rig
-    return (D @ points_by_pose(local)).reshape(-1, 6), F.reshape(3 * len(F), F.shape[2])
-
-
-def _landmarks_by_rig(
-    one: pose_only.PoseProblem, T: Array, pose: Array, by_rig: Array, field: Array, own: Array, sigma: float
-) -> Array:
-    """`by_rig` (M, 3, m) after the measurements, from a pose T (4, 4) that the errors move by `pose` (6, m).
-
-    The landmarks had covariances `own` (M, 3, 3) where the pose is known; `sigma` is the noise of a pixel.
-    """
-    local = (one.points - T[:3, 3]) @ T[:3, :3]
-    D = one.stereo.project(local)[1]
-    D[np.isnan(one.z[:, 2]), 2] = 0.0
-    H = D @ T[:3, :3].T
-    rest = np.nan_to_num(field) - (D @ points_by_pose(local)) @ pose - H @ by_rig
-    gain = own @ np.swapaxes(H, 1, 2) @ np.linalg.inv(H @ own @ np.swapaxes(H, 1, 2) + sigma**2 * np.eye(3))
-    return np.asarray(by_rig + gain @ rest)
-
-
-def _drift(s: SmootherState, solved: Solved) -> Array:
-    """By how much (6, 6) the newest pose is less certain than the anchor before it.
-
-    It stands for the covariance of the motion between them, which it is where the motion has nothing to do with the
-    error before.
-    """
-    inside, P = s.anchor >= solved.first, solved.covariance
-    before = solved.poses[s.anchor - solved.first] if inside else s.poses[s.of(s.anchor)]
-    A = adjoint(inverse(solved.poses[-1]) @ before)
-    values, vectors = np.linalg.eigh(P[12:, 12:] - A @ (P[:6, :6] if inside else s.spread[s.of(s.anchor)]) @ A.T)
-    return np.asarray((vectors * values.clip(min=0)) @ vectors.T)
 
 
 def _with(s: SmootherState, marks: SmootherLandmarks) -> SmootherState:
@@ -391,10 +302,3 @@ def _seen_from_newest(
     own = 0.5 * (own + np.swapaxes(own, 1, 2))
     by_rig = T[:3, :3] @ (by_rig - points_by_pose(local) @ s.by_rig[6:])
     return SmootherLandmarks.of(ids, s.serials, transform(T, local), own, inverses(own), False, by_rig)
-
-
-def _carried(J: Array, P: Array) -> Array:
-    """``J P Jᵀ`` (n, n), positive semidefinite whatever the rounding: after long gaps large numbers cancel."""
-    values, vectors = np.linalg.eigh(P)
-    A = J @ (vectors * np.sqrt(values.clip(min=0)))
-    return np.asarray(A @ A.T)

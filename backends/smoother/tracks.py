@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import SupportsFloat, SupportsIndex, SupportsInt
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -14,9 +14,6 @@ from backends.smoother.state import SmootherState
 from slam.geometry.se3 import Array, inverse, transform
 from slam.window.motion import STANDS, is_first
 
-#: Times of variables, as gtsam's stubs have them.
-Stamps = dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex]
-
 _LOOSE = np.diag(np.repeat([9.0, 1e4], 3))  # numerics: variances [rad²], [m²] of a motion that is unknown
 _LONGEST = 64  # cost: measurements in a factor of what was a variable; its cost grows with their square
 
@@ -25,7 +22,7 @@ _LONGEST = 64  # cost: measurements in a factor of what was a variable; its cost
 class Track:
     """A landmark's smart factor."""
 
-    factor: int  # see `SmootherLandmarks.factor`
+    since: int  # see `SmootherLandmarks.since`
     poses: list[int] = field(default_factory=list)  # numbers of the poses that measured it
     keys: list[int] = field(default_factory=list)  # their variables, and the measurements
     points: list[gtsam.StereoPoint2] = field(default_factory=list)
@@ -33,10 +30,6 @@ class Track:
     stereo: bool = False
     far: bool = False  # whether noise alone may put it behind the camera, by one of them
     slot: int = -1  # of the factor in the solver, −1 while there is none
-
-    def takes_any(self, first: int) -> bool:
-        """Whether it takes a measurement of what was a variable, if all its poses are to be from `first` on."""
-        return self.poses[0] >= first and len(self.poses) < _LONGEST
 
 
 @dataclass
@@ -48,8 +41,7 @@ class GraphProblem:
     removed: list[int] = field(default_factory=list)  # slots of factors that others replace
     # smart factors with new measurements, by serial number of the landmark and number of the first pose
     grown: dict[tuple[int, int], Track] = field(default_factory=dict)
-    # times of variables for the fixed lag: `SmootherState.ages`
-    stamps: Stamps = field(default_factory=dict)
+    ages: dict[Any, Any] = field(default_factory=dict)  # of variables, for the fixed lag: `SmootherState.ages`
     to_graph: Array = field(default_factory=lambda: np.eye(4))  # takes the state's coordinates to gtsam's
 
 
@@ -70,14 +62,14 @@ class Tracks:
         self._variables: dict[int, int] = {}  # numbers of the poses as long as which they stay
         self._oldest = 0  # number of the oldest pose in the graph
 
-    def add_pose(self, problem: GraphProblem, s: SmootherState, number: int, first: int) -> None:
-        """A pose, and its motion since the one before it, if it is not the first one."""
-        if number > first:
-            problem.factors.add(self._motion(s, number, first))
+    def add_pose(self, problem: GraphProblem, s: SmootherState, number: int, oldest: int) -> None:
+        """A pose, and its motion since the one before it, if it is not the `oldest` in the graph."""
+        if number > oldest:
+            problem.factors.add(self._motion(s, number, oldest))
         problem.values.insert(pose_key(number), to_pose3(problem.to_graph @ s.poses[s.of(number)]))
-        problem.stamps[pose_key(number)] = float(s.ages[s.of(number)])
+        problem.ages[pose_key(number)] = float(s.ages[s.of(number)])
 
-    def _motion(self, s: SmootherState, number: int, first: int) -> gtsam.NonlinearFactor:
+    def _motion(self, s: SmootherState, number: int, oldest: int) -> gtsam.NonlinearFactor:
         """What the motion model says of a pose: its velocity is that between the two poses before, but for noise.
 
         Where the graph has but one of these two, the pose is hardly held where it is.
@@ -85,41 +77,42 @@ class Tracks:
         row, (dt, before) = s.of(number), s.intervals(number)
         if s.rests[row]:
             return self._make.tie(number - 1, number, np.eye(4), STANDS**2 * np.eye(6))
-        if not is_first(before, dt) and number - 2 < first:
+        if not is_first(before, dt) and number - 2 < oldest:
             return self._make.tie(number - 1, number, inverse(s.poses[row - 1]) @ s.poses[row], _LOOSE)
         count = 2 if is_first(before, dt) else 3
         keys = [pose_key(i) for i in range(number + 1 - count, number + 1)]
         return self._make.motion(keys, np.array([before or np.nan, dt]))
 
-    def add_rows(self, problem: GraphProblem, s: SmootherState, number: int, first: int, begin: int = 0) -> None:
+    def add_rows(self, problem: GraphProblem, s: SmootherState, number: int, oldest: int, begin: int = 0) -> None:
         """What was measured from a pose, from some row on."""
         sight, make, some = s.sights[s.of(number)], self._make, bool(s.known or self._variables)
         key = pose_key(number)
-        rows = (column[begin:].tolist() for column in (sight.serials, sight.factor, sight.z))
-        for serial, factor, z in zip(*rows):
+        rows = (column[begin:].tolist() for column in (sight.serials, sight.since, sight.z))
+        for serial, since, z in zip(*rows):
             point = make.point(z)
-            if some and self._is_variable(problem, s, serial, factor, number, first):
+            if some and self._is_variable(problem, s, serial, since, oldest):
                 self._stays(problem, s, serial, number)
                 problem.factors.add(make.explicit(point, number, serial))
                 continue
             track = self._smart.get(serial)
-            goes_on = track is not None and (
-                track.factor == factor if factor != VARIABLE else track.takes_any(first - 1)  # it leaves after this one
-            )
-            if track is None or not goes_on:
-                self._smart[serial] = track = Track(factor)
+            if track is None or not (
+                track.since == since
+                if since != VARIABLE  # what was a variable, and is none in a graph that was built anew
+                else track.poses[0] >= oldest - 1 and len(track.poses) < _LONGEST
+            ):
+                self._smart[serial] = track = Track(since)
             track.poses.append(number)
             track.keys.append(key)
             track.points.append(point)
             track.stereo = track.stereo or z[2] == z[2]  # not NaN
             track.far = track.far or z[0] - z[2] < make.far
             problem.grown[serial, track.poses[0]] = track
-            if factor == VARIABLE and track.stereo:
+            if since == VARIABLE and track.stereo:
                 self._turn(problem, s, serial, number)
 
     def keep(self, problem: GraphProblem, s: SmootherState) -> list[int]:
         """Variables that the state keeps do not leave; their serial numbers."""
-        kept = list(filter(self._is_there, s.landmarks.serial[s.landmarks.factor == VARIABLE].tolist()))
+        kept = list(filter(self._is_there, s.landmarks.serial[s.landmarks.since == VARIABLE].tolist()))
         for serial in kept:
             self._stays(problem, s, serial, s.number)
         return kept
@@ -131,11 +124,11 @@ class Tracks:
     def _stays(self, problem: GraphProblem, s: SmootherState, serial: int, number: int) -> None:
         """A variable stays for as long as a pose."""
         self._variables[serial] = number
-        problem.stamps[landmark_key(serial)] = float(s.ages[s.of(number)])
+        problem.ages[landmark_key(serial)] = float(s.ages[s.of(number)])
 
     def _turn(self, problem: GraphProblem, s: SmootherState, serial: int, number: int) -> None:
         """A landmark becomes a variable, if the state has it as one, with the measurements of its smart factor."""
-        row = np.flatnonzero((s.landmarks.serial == serial) & (s.landmarks.factor == VARIABLE))
+        row = np.flatnonzero((s.landmarks.serial == serial) & (s.landmarks.since == VARIABLE))
         if not len(row):
             return
         track = self._smart.pop(serial)
@@ -147,20 +140,18 @@ class Tracks:
         problem.values.insert(landmark_key(serial), transform(problem.to_graph, s.landmarks.position[row])[0])
         self._stays(problem, s, serial, number)
 
-    def _is_variable(
-        self, problem: GraphProblem, s: SmootherState, serial: int, factor: int, number: int, first: int
-    ) -> bool:
-        """Whether a landmark is a variable; it becomes one if it is known, and that is not used up yet.
+    def _is_variable(self, problem: GraphProblem, s: SmootherState, serial: int, since: int, oldest: int) -> bool:
+        """Whether a landmark is a variable; it becomes one if it is known beforehand, and that was not used yet.
 
-        The covariance of a first pose has used it up if the landmark was measured by then; that of the pose with which
-        the problem begins is from before.
+        It was if the landmark was measured before the pose with which the graph begins: the prior of that pose holds
+        it. The prior of the pose with which the problem begins holds no measurement.
         """
         known = s.known.get(serial)
-        if serial in self._variables and (factor == VARIABLE or known is not None):
+        if serial in self._variables and (since == VARIABLE or known is not None):
             return self._is_there(serial)
-        if known is None or 0 <= known.pose < first:
+        if known is None or 0 <= known.pose < oldest:
             return False
-        if known.pose < 0 <= known.used <= first and first > s.begun:
+        if known.pose < 0 <= known.used <= oldest and oldest > s.begun:
             return False
         self.add_known(problem, s, serial)
         return True
@@ -190,7 +181,7 @@ class Tracks:
     def forget(self, s: SmootherState, oldest: int) -> None:
         """After its newest pose was solved for: forget what will not grow or come back; once in a while.
 
-        A landmark that was known beforehand stays listed, so that this is not told the graph again.
+        A landmark that was known beforehand stays listed, so that the graph is not told of it again.
         """
         self._oldest = oldest
         if self._lag is not None and not s.number % self._lag:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from frontends.surf.config import SurfConfig
 from frontends.surf.descriptor import TURNED_BOX, UPRIGHT_BOX, describe, gaussian_weights
 from frontends.surf.detector import detect_octave, layer_sizes, make_filters
-from frontends.surf.images import Picture, float_integral_image, integral_image
+from frontends.surf.images import Picture, integral_image
 from frontends.surf.keypoints import UPRIGHT_ANGLE, Keypoints
 from frontends.surf.localisation import first_of_each, localise
 from frontends.surf.orientation import DISC, orientations
@@ -112,7 +112,7 @@ class Surf:
         if not len(keypoints):
             return keypoints
         picture = Picture.of(image)
-        integral, uv, size = float_integral_image(picture.grey), keypoints.uv, keypoints.size
+        integral, uv, size = picture.integral, keypoints.uv, keypoints.size
         (place,) = self.workers.over(len(uv), lambda a, b: (localise(integral, uv[a:b], size[a:b], _REACH),))
         rows = np.flatnonzero(np.isfinite(place[:, 0]))
         rows = rows[np.argsort(-place[rows, 3], kind="stable")]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import column_times, invert_symmetric, multiply, row_times, square, trace, turn, turn_back
+from slam.kernels.linear import column_times, invert_symmetric, multiply, row_times, square, trace, turn
 from slam.kernels.se3 import transform, transform_back
 from slam.kernels.stereo import by_point, residual
 from slam.runtime.compilation import helper, kernel
@@ -195,7 +195,7 @@ def windows_in_body(A, p, dof, anchor, rows, history, known):
                 points[m, w, i] = column_times(T, i, away)
             there[m, w] = known[w] and dof[n, w] > 0
             if there[m, w]:
-                turn_back(T, A[n, w], turned[m, w])
+                turn(T.T, A[n, w], turned[m, w])
             else:
                 turned[m, w] = 0.0
     return points, turned, there

@@ -216,14 +216,3 @@ def turn(R, M, out):
         x, y, z = row_times(M, 0, R[i]), row_times(M, 1, R[i]), row_times(M, 2, R[i])
         for j in range(3):
             out[i, j] = x * R[j, 0] + y * R[j, 1] + z * R[j, 2]
-
-
-@helper
-def turn_back(R, M, out):
-    """``Rᵀ M R`` (3, 3) of a symmetric M, of which all is read."""
-    for i in range(3):
-        x = M[0, 0] * R[0, i] + M[0, 1] * R[1, i] + M[0, 2] * R[2, i]
-        y = M[1, 0] * R[0, i] + M[1, 1] * R[1, i] + M[1, 2] * R[2, i]
-        z = M[2, 0] * R[0, i] + M[2, 1] * R[1, i] + M[2, 2] * R[2, i]
-        for j in range(3):
-            out[i, j] = x * R[0, j] + y * R[1, j] + z * R[2, j]
