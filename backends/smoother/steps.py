@@ -21,7 +21,7 @@ from slam.window.gating import MIN_CONSENSUS
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.stereo import RectifiedMeasurement
 
-_DARK = 100  # frames without a measurement after which the problem begins anew: they would be poses of the graph
+_DARK = 100  # cost: frames without a measurement after which half of them leave: they would be poses of the graph
 _SAME = 0.5  # share of a pose's landmarks that another one must measure to say nothing new
 
 
@@ -41,7 +41,7 @@ class Steps(RectifiedMeasurement):
     def predicted(self, s: SmootherState, stamp: float, rests: bool = False) -> SmootherState:
         """With the newest frame at `stamp` [s], by the motion model."""
         if s.started and self.config.lag is not None and s.number - s.anchor >= _DARK:
-            s = _without_dark(s).without_old(self.config.past, self.config.lag)
+            s = s.without_dark(_DARK // 2)
         s = replace(
             s, stamps=np.append(s.stamps, stamp), rests=np.append(s.rests, rests),
             sights=(*s.sights, Sight.none()), measured=False,
@@ -125,7 +125,7 @@ class Steps(RectifiedMeasurement):
         ratio = math.sqrt(self.stereo.f / self.models.pixel_sigma)
         marks = s.landmarks.with_variables(seen, one.z, number, self.track, self.config.landmarks, found.T, ratio)
         after = replace(_seeing(s), landmarks=marks, poses=np.concatenate([s.poses[:-1], found.T[None]]))
-        after = self._measured(after, seen, one.z, s.oldest(self.config.lag, number))
+        after = self._measured(after, seen, one.z, s.oldest(self.config.lag or SmootherConfig.lag, number))
         solved, why = graph.followed(after)
         after = self.settled(after, solved)
         marks = after.landmarks.without_variables(number) if why else after.landmarks
@@ -264,16 +264,6 @@ def anchored(s: SmootherState) -> SmootherState:
         return _begun(s, s.poses[-1], s.spread[-1])
     by_anchor = adjoint(inverse(s.poses[-1]) @ s.poses[s.of(s.anchor)])
     return replace(s, joint=joint.anchored(s.joint, by_anchor, s.poses[-2:]), anchor=s.number)
-
-
-def _without_dark(s: SmootherState) -> SmootherState:
-    """With the newest pose, which measured nothing, as the first of a problem; landmarks are known from it."""
-    s = _left_behind(s)
-    s, rows = _begun(s, s.poses[-1], s.spread[-1]), np.flatnonzero(~s.landmarks.world)
-    marks = s.landmarks
-    local, own = pose_only.seen_from(s.poses[-1], marks.position[rows], marks.from_newest[rows])
-    known = {n: Known(x, P, s.number) for n, x, P in zip(marks.serial[rows].tolist(), local, own)}
-    return replace(s, known={**s.known, **known})
 
 
 def _left_behind(s: SmootherState) -> SmootherState:

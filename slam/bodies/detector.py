@@ -239,8 +239,7 @@ class MovingObjectDetector(ObjectDetector):
         farther than they are wide already.
         """
         body = changed(body, id=self._next_body, far=far)
-        parts = {id: b for id, b in self.bodies.items() if whole is None or b.apart_from == whole}
-        known = membership.reappeared(parts, body, self.setup.config.max_speed)
+        known = membership.reappeared(self.bodies, body, self.setup.config.max_speed, whole)
         if known is not None:
             tracks.give_up(np.flatnonzero(tracks.body == known.id))
             body = continued(body, known)

@@ -177,15 +177,16 @@ def tracks_on(body: Body, tracks: Tracks) -> IndexArray:
     return np.concatenate([np.flatnonzero(tracks.found & (tracks.body == body.id)), near])
 
 
-def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body | None:
+def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float, whole: int | None = None) -> Body | None:
     """The body out of view that a new one is, by position and velocity, perhaps seen from another side; else None.
 
-    The middle of what is seen may be off the body's by half its size, and no body is faster than `max_speed` [m/s]. A
-    body of its own may be anywhere within that, with any velocity: the known one must explain the new one better.
+    The middle of what is seen may be off the body's by half its size, and no body is faster than `max_speed` [m/s]. The
+    place of one that is gone says nothing, as it may be anywhere: it is known by its looks alone. But a part of a
+    `whole` is one that was known of it.
     """
     best, least = None, chi_square_limit(6, 0.99)
     for body in bodies.values():
-        if body.measured or not body.proven:
+        if body.measured or not body.proven or (body.gone if whole is None else body.apart_from != whole):
             continue
         gap = new.middle - body.middle
         reach = 0.5 * (body.across + new.across) + max_speed * (new.seen_at - body.seen_at)
@@ -194,9 +195,7 @@ def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body 
         change = new.velocity[3:] - body.velocity[3:]
         velocity = (new.velocity_covariance + body.velocity_covariance)[3:, 3:]
         off = float(gap @ np.linalg.solve(place, gap) + change @ np.linalg.solve(velocity, change))
-        anywhere = 2.0 * np.log((4.0 / 3.0 * np.pi) ** 2 * (reach * max_speed) ** 3)  # as −2 log of its density
-        known = off + float(np.linalg.slogdet(2 * np.pi * place)[1] + np.linalg.slogdet(2 * np.pi * velocity)[1])
-        if np.linalg.norm(gap) <= reach and off < least and known < anywhere:
+        if np.linalg.norm(gap) <= reach and off < least:
             best, least = body, off
     return best
 

@@ -154,6 +154,10 @@ def test_a_body_seen_again_is_known_by_its_place_and_velocity() -> None:
             2, body.middle + shift * np.array([1.0, 0, 0]), np.array([0, 0, 0, velocity, 0, 0]), TIMES, 0.0, 0.1
         )
         assert (membership.reappeared({1: body}, new, 1.5) is body) == same
+        gone = replace(body, missed=2, apart_from=7)
+        assert membership.reappeared({1: gone}, new, 1.5) is None, "it may be anywhere"
+        assert (membership.reappeared({1: gone}, new, 1.5, whole=7) is gone) == same
+        assert membership.reappeared({1: gone}, new, 1.5, whole=8) is None
         assert membership.reappeared({1: replace(body, measured=True)}, new, 1.5) is None
     again = continued(new_body(2, body.middle, MOVING, TIMES, 0.0, 0.1), body)
     assert again.id == 1
