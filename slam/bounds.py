@@ -35,22 +35,9 @@ def require_not_negative(config: object, ranges: Ranges | None = None, owner: st
     """
     mark, hints = f"{owner}: " if owner else "", _hints(type(config))  # type: ignore[arg-type]
     for f in fields(config):  # type: ignore[arg-type]
-        value, limits = getattr(config, f.name), (ranges or {}).get(f.name)
-        fault = _type_fault(value, hints[f.name])
-        numbers_of = value if isinstance(value, (tuple, list)) and not fault else (value,)
-        faults = [fault, *(_range_fault(number, limits) for number in numbers_of if not fault)]
-        if wanted := next(filter(None, faults), ""):
+        value = getattr(config, f.name)
+        if wanted := _wanted(value, hints[f.name], (ranges or {}).get(f.name)):
             raise ConfigurationError(f"{mark}{f.name} must be {wanted}, got {value!r}")
-
-
-def _range_fault(value: Any, limits: tuple[float, float] | None) -> str:
-    """What is required of a number outside its range; empty if it is inside, or no number."""
-    if not isinstance(value, numbers.Real) or isinstance(value, (bool, np.bool_)):
-        return ""
-    number: Any = value
-    least, most = limits or (0, _COUNTS if isinstance(number, numbers.Integral) else MOST)
-    tiny = limits is None and 0 < number < LEAST
-    return "" if least <= number <= most and not tiny else f"finite, from {least:g} to {most:g}"
 
 
 _hints = lru_cache(maxsize=64)(get_type_hints)
@@ -66,17 +53,23 @@ _TYPES: dict[Any, tuple[Any, str]] = {
 }
 
 
-def _type_fault(value: Any, hint: Any) -> str:
-    """What is required of a value of the wrong type; empty if the type is right."""
+def _wanted(value: Any, hint: Any, limits: tuple[float, float] | None) -> str:
+    """What is required of a value of the wrong type, or out of its range; empty if it is right."""
     kind, kinds = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
-        faults = [_type_fault(value, one) for one in kinds]
-        return "" if "" in faults else " or ".join(filter(None, faults))
+        faults = [_wanted(value, one, limits) for one in kinds]
+        return "" if "" in faults else " or ".join(faults)
     if kind is tuple:
-        return _tuple_fault(value, kinds)
+        return _wanted_each(value, kinds, limits)
     of_class = (kind, f"of type {getattr(kind, '__name__', kind)}") if is_dataclass(kind) else (object, "")
     accepted, words = _TYPES.get(kind, of_class)
-    fine = isinstance(value, accepted) and not (kind in (int, float) and isinstance(value, (bool, np.bool_)))
+    fine = isinstance(value, accepted)
+    if kind in (int, float):
+        if not fine or isinstance(value, (bool, np.bool_)):
+            return words
+        least, most = limits or (0, _COUNTS if isinstance(value, numbers.Integral) else MOST)
+        tiny = limits is None and 0 < value < LEAST
+        return "" if least <= value <= most and not tiny else f"finite, from {least:g} to {most:g}"
     if kind is str:
         fine = fine and len(value) <= _WORD and "\0" not in value
     elif kind is dict:
@@ -84,8 +77,8 @@ def _type_fault(value: Any, hint: Any) -> str:
     return "" if fine else words
 
 
-def _tuple_fault(value: Any, kinds: tuple[Any, ...]) -> str:
-    """As `_type_fault`, for a tuple, or a list in its place."""
+def _wanted_each(value: Any, kinds: tuple[Any, ...], limits: tuple[float, float] | None) -> str:
+    """As `_wanted`, for a tuple, or a list in its place."""
     if not isinstance(value, (tuple, list)):
         return "a list"
     if kinds[1:] == (Ellipsis,):
@@ -94,8 +87,8 @@ def _tuple_fault(value: Any, kinds: tuple[Any, ...]) -> str:
         kinds = kinds[:1] * len(value)
     if len(value) != len(kinds):
         return f"a list of {len(kinds)} values"
-    fault = next(filter(None, map(_type_fault, value, kinds)), "")
-    return fault and f"a list, each {fault}"
+    wanted = next(filter(None, (_wanted(one, kind, limits) for one, kind in zip(value, kinds))), "")
+    return wanted and f"a list, each {wanted}"
 
 
 def from_options(kind: type[_C], owner: str, options: Mapping[str, Any]) -> _C:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
-from typing import Any, get_args, get_type_hints
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 from slam.atlas.config import AtlasConfig
 from slam.bodies.config import ObjectsConfig
-from slam.bounds import MOST, require_not_negative
+from slam.bounds import require_not_negative
 from slam.calibration.config import SelfCalibrationConfig
 from slam.errors import ConfigurationError
 from slam.models import EstimatorModels, models_for
-from slam.settings import apply_settings
+from slam.settings import with_changes
 from slam.tracks.config import AssociationConfig, MapConfig
 
 #: What is set by kind of motion. A car does not soon return to what it has passed, and gets so much nearer to what lies
@@ -85,14 +85,13 @@ class SystemConfig:
         return asdict(self)
 
     @classmethod
-    def from_json(cls, tree: dict[str, Any]) -> SystemConfig:
-        """The configuration of a tree of plain types, as `to_json` writes it; what is left out has its default.
+    def from_json(cls, tree: Mapping[str, Any]) -> SystemConfig:
+        """The configuration of a tree as `to_json` gives it, such as the settings in a run's ``config.json``.
 
         Raises:
             ConfigurationError: a key is unknown, or a value is of the wrong type or out of range.
         """
-        built: SystemConfig = _built(cls, tree)
-        return built
+        return cls().with_settings(tree)
 
     def with_settings(self, settings: Sequence[str] | Mapping[str, Any]) -> SystemConfig:
         """A copy with settings applied: ``{"map.max_landmarks": 300}``, or ``["map.max_landmarks=300"]``.
@@ -103,39 +102,9 @@ class SystemConfig:
         Raises:
             ConfigurationError: not of that form, an unknown key, a value of the wrong type or out of range.
         """
-        tree = self.to_json()
-        apply_settings(tree, settings)
-        return self.from_json(tree)
+        changed: SystemConfig = with_changes(self, settings)
+        return changed
 
 
 #: What the system itself gives to front ends and back ends that it makes.
 _GIVEN = ("self", "rig", "models")
-
-
-def _built(kind: Any, tree: Mapping[str, Any], where: str = "") -> Any:
-    """A dataclass of settings, and those in it, from a tree of plain types; `where` is its place in the whole."""
-    if not isinstance(tree, Mapping):
-        what = f"setting {where[:-1]}" if where else "settings"
-        raise ConfigurationError(f"{what} must be an object, got {tree!r:.80}")
-    hints, names, values = get_type_hints(kind), {f.name for f in fields(kind)}, {}
-    for key, value in tree.items():
-        if key not in names:
-            raise ConfigurationError(f"setting {where}{key}: there is no such setting in this version")
-        if is_dataclass(hints[key]):
-            value = _built(hints[key], value, f"{where}{key}.")
-        values[key] = _as_hinted(value, hints[key])
-    try:
-        return kind(**values)
-    except ConfigurationError as error:
-        said = str(error).removeprefix(f"{where[:-1].rpartition('.')[2]}: ")  # the section names itself
-        raise ConfigurationError(f"setting {where}{said}") from None
-
-
-def _as_hinted(value: Any, hint: Any) -> Any:
-    """A value of a text as the field has it: ``3`` is 3.0 where numbers need not be whole, a list is a tuple."""
-    if isinstance(value, list):
-        inner = next(iter(get_args(hint)), None)
-        return tuple(_as_hinted(one, inner) for one in value)
-    if hint is float and type(value) is int and abs(value) <= MOST:
-        return float(value)
-    return value

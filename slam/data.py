@@ -44,10 +44,7 @@ class StereoFrame:
     left_mask: BoolArray | None = None
     right_mask: BoolArray | None = None
 
-    def __repr__(self) -> str:
-        height, width = self.left.shape[:2]
-        right = "" if self.right is not None else ", no right image"
-        return f"StereoFrame({self.index}, {self.stamp:.3f} s, {width}x{height} {self.left.dtype}{right})"
+    __repr__ = of_shapes
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,11 +150,10 @@ class Observations:
         if n and max(np.abs(self.uv_left).max(), np.abs(np.nan_to_num(self.uv_right)).max()) > FARTHEST_PIXEL:
             raise MeasurementError(f"observations: a pixel lies more than {FARTHEST_PIXEL:g} px off: in no image")
 
+    __repr__ = of_shapes
+
     def __len__(self) -> int:
         return len(self.ids)
-
-    def __repr__(self) -> str:
-        return f"Observations({count(len(self), 'landmark')}, {int(self.has_stereo.sum())} with a right pixel)"
 
     @property
     def has_stereo(self) -> BoolArray:
@@ -228,10 +224,7 @@ class UpdateReport:
     nis: float
     dof: int
 
-    def __repr__(self) -> str:
-        why = f" ({self.reason})" if self.reason else ""
-        taken = f"{len(self.used)} used, {len(self.rejected)} rejected"
-        return f"UpdateReport({self.status.value}{why}, {taken}, NIS {self.nis:.1f} of {self.dof})"
+    __repr__ = of_shapes
 
     @classmethod
     def nothing(cls, status: UpdateStatus, reason: str, rejected: IdArray | None = None) -> UpdateReport:

@@ -1,11 +1,13 @@
-"""``section.key=value`` settings, put into a tree of plain types."""
+"""``section.key=value`` settings, put into a tree of frozen dataclasses."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from dataclasses import asdict, is_dataclass, replace
+from typing import Any, get_args, get_type_hints
 
+from slam.bounds import MOST
 from slam.errors import ConfigurationError
 from slam.naming import suggestion, unknown
 
@@ -25,23 +27,61 @@ SETTABLE: dict[str, tuple[str, ...]] = {
 }
 
 
-def apply_settings(tree: dict[str, Any], settings: Sequence[str] | Mapping[str, Any]) -> None:
-    """Change leaves of a configuration's tree in place; types and ranges are checked when it is read back.
+def with_changes(config: Any, settings: Sequence[str] | Mapping[str, Any]) -> Any:
+    """A configuration, a tree of dataclasses, with other values of some settings, converted and checked by its classes.
 
-    Settings are texts such as ``"map.max_landmarks=300"``, whose values are JSON or plain words; or values by key.
-    Raises ConfigurationError where a text is not of that form, or its section or key is unknown.
+    Settings are texts such as ``"map.max_landmarks=300"``, whose values are JSON or plain words; or values by key, or
+    by section and key.
+    Raises ConfigurationError where a text is not of that form, a section or key is unknown, or a value is refused.
     """
+    given: list[tuple[str, Any, str]] = []  # keys, values, and both as they were given
     if isinstance(settings, Mapping):
-        for key, value in settings.items():
-            _set(tree, str(key).split("."), value, f"{key}={value}")
-        return
-    if not isinstance(settings, (list, tuple)) or not all(isinstance(setting, str) for setting in settings):
+        given = [(key, value, f"{key}={value}") for key, value in leaves(settings)]
+    elif not isinstance(settings, (list, tuple)) or not all(isinstance(setting, str) for setting in settings):
         raise ConfigurationError("settings must be a list of texts section.key=value, or a dict of values by key")
-    for setting in settings:
-        path, equals, text = setting.partition("=")
-        if not equals:
-            raise ConfigurationError(f"setting {setting!r} is not of the form section.key=value")
-        _set(tree, path.strip().split("."), _value(text.strip()), setting)
+    else:
+        for setting in settings:
+            key, equals, text = setting.partition("=")
+            if not equals:
+                raise ConfigurationError(f"setting {setting!r} is not of the form section.key=value")
+            given.append((key.strip(), _value(text.strip()), setting))
+    known, changes = list(dict(leaves(asdict(config)))), dict[str, Any]()
+    for key, value, setting in given:
+        section, dot, option = key.partition(".")
+        if section in _FREE and dot:
+            changes.setdefault(section, {})[option] = value
+            continue
+        if key not in known:
+            raise ConfigurationError(f"setting {setting!r}: {_unknown(key, known)}")
+        node, (*sections, name) = changes, key.split(".")
+        for section in sections:
+            node = node.setdefault(section, {})
+        node[name] = value
+    return _replaced(config, changes)
+
+
+def _replaced(part: Any, changes: Mapping[str, Any], where: str = "") -> Any:
+    """A dataclass of settings, and those in it, with other values; `where` is its place in the whole."""
+    values, hints = dict(changes), get_type_hints(type(part))
+    for name, value in changes.items():
+        before = getattr(part, name)
+        if is_dataclass(before):
+            values[name] = _replaced(before, value, f"{where}{name}.")
+        else:
+            values[name] = before | value if isinstance(before, dict) else _as_hinted(value, hints[name])
+    try:
+        return replace(part, **values)
+    except ConfigurationError as error:
+        said = str(error).removeprefix(f"{where[:-1].rpartition('.')[2]}: ")  # the section names itself
+        raise ConfigurationError(f"setting {where}{said}") from None
+
+
+def _as_hinted(value: Any, hint: Any) -> Any:
+    """A value of a text as the field has it: ``3`` is 3.0 where numbers need not be whole, a list is a tuple."""
+    if isinstance(value, list):
+        inner = next(iter(get_args(hint)), None)
+        return tuple(_as_hinted(one, inner) for one in value)
+    return float(value) if hint is float and type(value) is int and abs(value) <= MOST else value
 
 
 def can_be_set(key: str, owner: str = "") -> bool:
@@ -52,11 +92,11 @@ def can_be_set(key: str, owner: str = "") -> bool:
 
 
 def require_settable(settings: Iterable[str], tree: Mapping[str, Any], frontend: str) -> None:
-    """Refuse texts ``section.key=value`` of settings that are the program's own; other faults `apply_settings` finds.
+    """Refuse texts ``section.key=value`` of settings that are the program's own; other faults `with_changes` finds.
 
     `tree` is the configuration that they are for, `frontend` the name of the front end. Raises ConfigurationError.
     """
-    known = set(leaves(dict(tree)))
+    known = dict(leaves(tree))
     for key in (text.partition("=")[0].strip() for text in settings):
         own = key.startswith("frontend.") and frontend in SETTABLE
         if (key in known or own) and not can_be_set(key, frontend if own else ""):
@@ -72,42 +112,30 @@ def _value(text: str) -> Any:
         return text
 
 
-def _set(tree: dict[str, Any], path: list[str], value: Any, setting: str) -> None:
-    """Set one leaf of the tree; every key on the way must exist, except options of front end and back end."""
-    node = tree
-    for depth, key in enumerate(path):
-        last = depth == len(path) - 1
-        free = last and depth > 0 and path[0] in _FREE
-        if last and isinstance(node.get(key), dict):
-            raise ConfigurationError(f"setting {setting!r}: {key!r} is a section; set {'.'.join(path)}.KEY=VALUE")
-        if not free and (key not in node or (last and depth == 0) or not (last or isinstance(node[key], dict))):
-            what = "key" if last else "section"
-            raise ConfigurationError(f"setting {setting!r}: {_unknown(what, key, path[:depth], tree, path[-1])}")
-        if last:
-            node[key] = value
-        else:
-            node = node[key]
-
-
-def _unknown(what: str, name: str, above: list[str], tree: dict[str, Any], leaf: str) -> str:
-    """The line for an unknown name in a section; a key that another one has is suggested with it.
+def _unknown(key: str, known: Sequence[str]) -> str:
+    """The line for a key that is none of those `known`; one that another section has is suggested with it.
 
     Only what users can set is named.
     """
-    settable = [key for key in leaves(tree) if can_be_set(key) and key.partition(".")[0] not in _FREE]
-    prefix = "".join(f"{key}." for key in above)
-    below = [key.removeprefix(prefix).partition(".")[0] for key in settable if key.startswith(prefix)]
-    known = list(dict.fromkeys([*below, *([] if above else _FREE)]))
-    elsewhere = [key for key in settable if key.rpartition(".")[2] == leaf]
+    if key in _FREE or any(other.startswith(f"{key}.") for other in known):
+        return f"{key.rpartition('.')[2]!r} is a section; set {key}.KEY=VALUE"
+    settable = [other for other in known if can_be_set(other)]
+    above, (name, *rest) = "", key.split(".")
+    while rest and any(other.startswith(f"{above}{name}.") for other in known):
+        above, name, rest = f"{above}{name}.", rest[0], rest[1:]
+    what = "section" if rest else "key"
+    below = (other.removeprefix(above).partition(".")[0] for other in settable if other.startswith(above))
+    names = list(dict.fromkeys([*below, *([] if above else _FREE)]))
+    elsewhere = [other for other in settable if other.rpartition(".")[2] == key.rpartition(".")[2]]
     if not elsewhere:
-        return unknown(what, name, known)
-    return f"unknown {what} {name!r} (did you mean {' or '.join(map(repr, elsewhere))}?); known: {', '.join(known)}"
+        return unknown(what, name, names)
+    return f"unknown {what} {name!r} (did you mean {' or '.join(map(repr, elsewhere))}?); known: {', '.join(names)}"
 
 
-def leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[str]:
-    """Dotted names of all settings in a configuration's tree, such as ``"map.grid"``."""
+def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names of all settings in a configuration's tree, such as ``"map.grid"``, and their values."""
     for key, value in tree.items():
         if isinstance(value, dict):
             yield from leaves(value, f"{prefix}{key}.")
         else:
-            yield f"{prefix}{key}"
+            yield f"{prefix}{key}", value

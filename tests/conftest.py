@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-import logging
 import os
-import signal
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -41,40 +35,3 @@ def slam_data() -> Path:
     if not folder or not Path(folder).is_dir():
         pytest.skip("real sequences: set SLAM_DATA to the folder that holds them")
     return Path(folder)
-
-
-@pytest.fixture
-def slam_command(capfd, monkeypatch) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Runs the command ``slam`` in this process: a fresh interpreter takes a second to import what it needs.
-
-    What is written to the file descriptors counts, so that the messages of compiled libraries do, too; that kernels are
-    being compiled is left out, because it depends on which test comes first.
-    """
-    from slam.commands.cli import main
-
-    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-        words = ["slam", *map(str, arguments)]
-        monkeypatch.setattr(sys, "argv", words)
-        capfd.readouterr()
-        with _log_and_signals_of_its_own(), pytest.raises(SystemExit) as end:
-            main()
-        output, errors = capfd.readouterr()
-        lines = [line for line in errors.splitlines(keepends=True) if not line.startswith("INFO: compiling ")]
-        return subprocess.CompletedProcess(words, end.value.code or 0, output, "".join(lines))
-
-    return run
-
-
-@contextmanager
-def _log_and_signals_of_its_own() -> Iterator[None]:
-    """As a new process has them, and afterwards as they were."""
-    root, numbers = logging.getLogger(), (signal.SIGINT, signal.SIGTERM)
-    handlers, level, actions = root.handlers[:], root.level, [signal.getsignal(number) for number in numbers]
-    root.handlers[:] = []
-    try:
-        yield
-    finally:
-        root.handlers[:] = handlers
-        root.setLevel(level)
-        for number, action in zip(numbers, actions):
-            signal.signal(number, action)

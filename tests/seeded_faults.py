@@ -58,8 +58,8 @@ NEAREST = {
 FAULTS = (
     # the filter
     Fault(
-        "turning the camera moves points the wrong way", "backends/ekf/motion.py",
-        "W[:3, 3:], W[3:, 3:] = hat(self.x[:3]) @ turn, turn", "W[:3, 3:], W[3:, 3:] = -hat(self.x[:3]) @ turn, -turn",
+        "turning the camera moves points the wrong way", "backends/ekf/camera.py",
+        "hat(camera.pose[:3, 3]) @ turning, turning", "-hat(camera.pose[:3, 3]) @ turning, -turning",
     ),
     Fault(
         "the last poses are corrected as if they were in the state", "backends/ekf/covariance.py",

@@ -163,7 +163,7 @@ def test_settings_exist(page):
 def test_worlds_and_scripts_exist(page):
     text = page.read_text(encoding="utf-8")
     for name, query in re.findall(r"synthetic:([a-z]+)(?!:)\b(?:\?([\w=&.:,]+))?", text):
-        worlds.parse_query(name, "" if "key=" in query else query, worlds.options(name))
+        worlds.values_of(name, "" if "key=" in query else query)
     for script in re.findall(r"\b(?:python|pytest)(?: -\S+)* ((?:experiments|benchmarks|docs|tests)/\S+?\.py)", text):
         assert (ROOT / script).is_file(), script
 

@@ -80,4 +80,4 @@ class EkfBackend(LandmarkFilter):
             use = EkfConfig(measurement="left", iterations=1, landmarks="euclidean", consistent=False)
             models = replace(models, slide=SlideModel())
         first = EulerCamera.first(models, use.consistent)
-        super().__init__(rig, models, *first, COORDINATES[use.landmarks], use.iterations, use.measurement == "stereo")
+        super().__init__(rig, models, first, COORDINATES[use.landmarks], use.iterations, use.measurement == "stereo")

@@ -2,7 +2,7 @@
 
 An error is what is true less what is believed: adding it corrects. The camera's (12,) is of its pose (6), velocity (3)
 and rate (3), in numbers that each camera chooses. An error of the pose is as if the whole world were displaced: by how
-much says `Camera.displacement`. What a displacement of the world changes in a landmark's coordinates is ``gauge`` of
+much says `displacement`. What a displacement of the world changes in a landmark's coordinates is ``gauge`` of
 `backends.ekf.landmarks`; the product says how an error of the pose moves landmarks that the camera takes along.
 """
 
@@ -12,8 +12,8 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from backends.ekf.covariance import POSE
-from slam.geometry.se3 import Array
+from backends.ekf.covariance import CAMERA, POSE
+from slam.geometry.se3 import Array, hat
 from slam.models import ANYWHERE, EstimatorModels
 
 _ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an attitude [rad]
@@ -30,14 +30,16 @@ class Camera(Protocol):
         """``T_world_left`` (4, 4)."""
 
     @property
+    def v(self) -> Array:
+        """Velocity (3,) in the world [m/s]."""
+
+    @property
+    def turning(self) -> Array:
+        """Derivative (3, 3) of the attitude, turned about the world's axes, by its three numbers in the error."""
+
+    @property
     def transports(self) -> bool:
         """Whether the covariance is transported to a corrected state; see `FilterState.corrected`."""
-
-    def by_error(self) -> Array:
-        """Derivative (6, 6) of the pose's right perturbation [rotation, translation] by the pose's error."""
-
-    def displacement(self) -> Array:
-        """The displacement (6, 6) of the world [shift, turn about its origin] that is an error of the pose."""
 
     def moved(self, error: Array) -> Self:
         """After an error (12,) is corrected."""
@@ -48,16 +50,10 @@ class Camera(Protocol):
     def at(self, T: Array) -> Self:
         """At another pose (4, 4), with the same velocities."""
 
-    def facing(self, T: Array) -> tuple[Self, Array]:
+    def regular_towards(self, T: Array) -> tuple[Self, Array]:
         """The same camera, with an error that is regular from here to a pose T; its derivative (12, 12) by this one's.
 
         The camera itself where its error is regular there as it is.
-        """
-
-    def transport(self, to: Self) -> Array:
-        """An error as one of another camera (12, 12): the same displacement of the world, ``W(to) J = W``.
-
-        If the camera does not transport, the same numbers.
         """
 
     def advanced(self, dt: float) -> tuple[Self, Array, Array]:
@@ -66,8 +62,39 @@ class Camera(Protocol):
     def stopped(self) -> Self:
         """With the same pose, and no velocity."""
 
-    def of_body(self, P: Array) -> Array:
-        """A covariance (12, 12) with turns and rates about the body's axes, the same about all, as one of the error."""
+
+def pose_by_error(camera: Camera) -> Array:
+    """Derivative (6, 6) of the pose's right perturbation [rotation, translation] by the pose's error."""
+    J, back = np.zeros((POSE, POSE)), camera.pose[:3, :3].T
+    J[:3, 3:], J[3:, :3] = back @ camera.turning, back
+    return J
+
+
+def displacement(camera: Camera) -> Array:
+    """The displacement W (6, 6) of the world [shift, turn about its origin] that is an error of the pose."""
+    W, turning = np.eye(POSE), camera.turning
+    W[:3, 3:], W[3:, 3:] = hat(camera.pose[:3, 3]) @ turning, turning
+    return W
+
+
+def transport(camera: Camera, to: Camera) -> Array:
+    """An error as one of another camera (12, 12): the same displacement of the world, ``W(to) J = W``.
+
+    If the camera does not transport, the same numbers.
+    """
+    J = np.eye(CAMERA)
+    if camera.transports:
+        turning, shift = camera.turning, camera.pose[:3, 3] - to.pose[:3, 3]
+        J[3:6, 3:6] = np.linalg.solve(to.turning, turning)
+        J[:3, 3:6], J[6:9, 3:6] = hat(shift) @ turning, hat(camera.v - to.v) @ turning
+    return J
+
+
+def from_body_axes(camera: Camera, P: Array) -> Array:
+    """A covariance (12, 12) with turns and rates about the body's axes, the same about all, as one of the error."""
+    E = np.eye(CAMERA)
+    E[3:6, 3:6] = E[9:, 9:] = np.linalg.solve(camera.turning, camera.pose[:3, :3])
+    return np.asarray(E @ P @ E.T)
 
 
 #: A camera that has moved; its error is a matrix (12, 12) times what it was, plus noise of a covariance (12, 12).
@@ -86,7 +113,7 @@ def predicted(camera: Camera, models: EstimatorModels, P: Array, dt: float, rest
         return camera.stopped(), _AT_REST, np.zeros_like(P)
     if _any_attitude(models, P, dt):
         pose = min(models.initial_velocity_sigma * dt, ANYWHERE), np.pi / np.sqrt(3)
-        return camera.stopped(), _POSITION, camera.of_body(prior(models, pose))
+        return camera.stopped(), _POSITION, from_body_axes(camera, prior(models, pose))
     camera, A, W = camera.advanced(dt)
     return camera, A, (W * np.repeat(models.motion.velocity_variance(dt), 3)) @ W.T
 

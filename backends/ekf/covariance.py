@@ -158,7 +158,7 @@ class Covariance:
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
         mirror(P, CAMERA)
         D[:CAMERA], D[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
-        # with T = 1 + [D, 0]: T P Tᵀ = P + D Yᵀ + Y Dᵀ,  Y = P[:, :12] + D P_cc / 2
+        # F P Fᵀ = P + D Yᵀ + Y Dᵀ, with F = 1 + [D, 0] and Y = P[:, :12] + D P_cc / 2
         half = 0.5 * D @ P[:CAMERA, :CAMERA]
         P = dsyr2k(1.0, D, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
         by_rig += D @ by_rig[:CAMERA]

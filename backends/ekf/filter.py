@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from backends.ekf.camera import Camera, Motion, predicted
+from backends.ekf.camera import Camera, Motion, displacement, from_body_axes, pose_by_error, predicted, prior
 from backends.ekf.covariance import CAMERA, POSE, RECENT, Covariance, positive
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
-from backends.ekf.solve import agreement
+from backends.ekf.solve import correction
 from backends.ekf.state import FilterState
 from slam.checks import known_landmarks, require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
@@ -37,8 +37,7 @@ class LandmarkFilter:
     Args:
         rig: the cameras, rectified.
         models: noise, priors, motion and gate.
-        camera: the first one.
-        P: covariance (12, 12) of its error.
+        camera: the first one, in its prior.
         coordinates: of the landmarks.
         iterations: most linearisations of an update.
         stereo: whether the right pixel is measured.
@@ -53,15 +52,15 @@ class LandmarkFilter:
     most_landmarks = 2000
 
     def __init__(
-        self, rig: StereoRig, models: EstimatorModels, camera: Camera, P: Array, coordinates: Coordinates,
-        iterations: int, stereo: bool = True, /,
+        self, rig: StereoRig, models: EstimatorModels, camera: Camera, coordinates: Coordinates, iterations: int,
+        stereo: bool = True, /,
     ) -> None:  # fmt: skip
         # by position alone: they are no options of a back end
         self.rig, self.models = rig, models
         self._coordinates, self._iterations, self._stereo = coordinates, iterations, stereo
         self._measure = RectifiedMeasurement(rig, models.with_slide())
         self._slide = Slide.of(models, self._measure.stereo.f)
-        self.state = FilterState.first(camera, P)
+        self.state = FilterState.first(camera, from_body_axes(camera, prior(models)))
         self._past: list[tuple[float, Array]] = []  # stamps and poses before the state's
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
@@ -69,12 +68,12 @@ class LandmarkFilter:
     @one_blas_thread
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
-        return self._predicted(stamp, rests=False)
+        return self._moved_on(stamp, rests=False)
 
     @one_blas_thread
     def predict_at_rest(self, stamp: float) -> Prediction:
         """See `slam.interfaces.RestingBackend.predict_at_rest`."""
-        return self._predicted(stamp, rests=True)
+        return self._moved_on(stamp, rests=True)
 
     @one_blas_thread
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
@@ -129,7 +128,7 @@ class LandmarkFilter:
         """
         s = self._started("recent")
         n = min(require_recent(self.name, n), s.frame + 1, RECENT + 1)
-        return RecentPoses(*self._path(n), s.covariance.joint_poses(s.camera.by_error(), n))
+        return RecentPoses(*self._path(n), s.covariance.joint_poses(pose_by_error(s.camera), n))
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
@@ -163,7 +162,7 @@ class LandmarkFilter:
             raise MeasurementError(f"{self.name}: {TOO_LATE}")
         by_rig = np.zeros((CAMERA, m))
         if pose is not None:
-            by_rig[:POSE] = np.linalg.solve(s.camera.by_error(), pose)
+            by_rig[:POSE] = np.linalg.solve(pose_by_error(s.camera), pose)
         self._measure = replace(self._measure, field=field)
         self.state = replace(s, covariance=Covariance.of_camera(s.covariance.camera, by_rig))
 
@@ -172,7 +171,7 @@ class LandmarkFilter:
         s = self._started("sensitivities")
         rows = s.landmarks.rows_of(ids)
         D = self._coordinates.jacobian(s.landmarks.anchors[rows], s.landmarks.c[rows])
-        return s.camera.by_error() @ s.covariance.by_rig[:POSE], D @ s.covariance.landmarks_by_rig(rows)
+        return pose_by_error(s.camera) @ s.covariance.by_rig[:POSE], D @ s.covariance.landmarks_by_rig(rows)
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
@@ -204,7 +203,7 @@ class LandmarkFilter:
         path = [*before, (s.stamp, s.pose)] if s.frame >= 0 else []
         return np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4)
 
-    def _predicted(self, stamp: float, rests: bool) -> Prediction:
+    def _moved_on(self, stamp: float, rests: bool) -> Prediction:
         """Go to a time, and say what is in the angle of view then; whether the camera rests meanwhile."""
         s = self.state
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
@@ -216,10 +215,10 @@ class LandmarkFilter:
         after = s.advanced(float(stamp), motion, rows, self._slide)
         marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
-        by_pose = -toward @ (marks.gauge @ after.camera.displacement())  # (M, 3, 6), of them as seen from the camera
-        seen = (by_pose @ after.covariance.pose + 2 * toward @ cross) @ by_pose.transpose(0, 2, 1)
-        seen = 0.5 * (seen + seen.transpose(0, 2, 1)) + toward @ blocks @ toward.transpose(0, 2, 1)
-        left, right, S = self._measure.pixels((marks.points - T[:3, 3]) @ T[:3, :3], seen)
+        by_pose = -toward @ (marks.gauge @ displacement(after.camera))  # (M, 3, 6), of them as seen from the camera
+        local = (by_pose @ after.covariance.pose + 2 * toward @ cross) @ by_pose.transpose(0, 2, 1)
+        local = 0.5 * (local + local.transpose(0, 2, 1)) + toward @ blocks @ toward.transpose(0, 2, 1)
+        left, right, S = self._measure.pixels((marks.points - T[:3, 3]) @ T[:3, :3], local)
         prediction = Prediction(after.stamp, T.copy(), after.pose_covariance(), marks.ids, left, right, S)
         self._past[after.frame - 1 :] = [(s.stamp, s.pose)] if after.frame else []
         self.state = after
@@ -238,14 +237,14 @@ class LandmarkFilter:
             s.camera, s.covariance, s.landmarks.select(rows), rows, z, self._measure, self._coordinates,
             self._iterations,
         )  # fmt: skip
-        update = update if guess is None else update.facing(guess)
+        update = update if guess is None else update.regular_towards(guess)
 
-        def search() -> Array | None:
+        def search() -> Array | None:  # by the whole noise: features may have slid by any way since
             T, measure = s.pose if guess is None else guess, RectifiedMeasurement(self.rig, self.models)
             return landmarks_pose(measure, update.landmarks.points, z, T, s.frame + 1)
 
         try:
-            found = agreement(update, guess, search)
+            found = correction(update, guess, search)
             if found is None:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids.copy())

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dpotrs
 
-from backends.ekf.camera import Camera
+from backends.ekf.camera import Camera, displacement, transport
 from backends.ekf.covariance import CAMERA, HEAD, POSE, Covariance, reordered
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.data import BoolArray, IndexArray
@@ -43,9 +43,9 @@ class Update:
         """Pixel noise [px]."""
         return self.measure.models.pixel_sigma
 
-    def facing(self, T: Array) -> Update:
+    def regular_towards(self, T: Array) -> Update:
         """The same prior in coordinates that are regular from a pose T (4, 4) to here; itself where they are."""
-        camera, J = self.camera.facing(T)
+        camera, J = self.camera.regular_towards(T)
         if camera is self.camera:
             return self
         return replace(self, camera=camera, covariance=self.covariance.camera_moved(J, np.zeros((CAMERA, CAMERA))))
@@ -58,21 +58,21 @@ class Update:
     @cached_property
     def lever(self) -> Array:
         """That (M, 3, 6) of the prior, see the module."""
-        return self.landmarks.gauge @ self.camera.displacement()
+        return self.landmarks.gauge @ displacement(self.camera)
 
     @cached_property
-    def gauge_projector(self) -> Array | None:
-        """The part A (6, 6 + 3M) of an error of pose and measured landmarks that displaces both in the world.
+    def gauge_part(self) -> Array | None:
+        """The error G x (6,) of the pose with which all of an error x (6 + 3M,) but what is independent of it moves.
 
-        A displacement N is an error of the pose with the landmarks along by the lever. What is left of an error is to
-        be independent of that part: ``A = (Nᵀ P⁻¹ N)⁻¹ Nᵀ P⁻¹``. None where P has lost its digits.
+        A displacement U of the world is an error of the pose that takes the landmarks along by the lever. What U G x
+        leaves of x is to be independent of it: ``G = (Uᵀ P⁻¹ U)⁻¹ Uᵀ P⁻¹``. None where P has lost its digits.
         """
         root, info = dpotrf(self.covariance.P[self.numbers[:, None], self.numbers], lower=1)
-        N = np.concatenate([np.eye(POSE), self.lever.reshape(-1, POSE)])
-        Z = dpotrs(root, N, lower=1)[0] if info == 0 else np.full(N.shape, np.nan)
-        return np.linalg.solve(N.T @ Z, Z.T) if np.isfinite(Z).all() else None
+        U = np.concatenate([np.eye(POSE), self.lever.reshape(-1, POSE)])
+        Z = dpotrs(root, U, lower=1)[0] if info == 0 else np.full(U.shape, np.nan)
+        return np.linalg.solve(U.T @ Z, Z.T) if np.isfinite(Z).all() else None
 
-    def predicted(self, camera: Camera, change: Array) -> Array:
+    def pixels_from(self, camera: Camera, change: Array) -> Array:
         """What a camera would measure (M, 3) [px] of landmarks if the state changes (n,); NaN behind it."""
         marks, asked = self.landmarks, change[self.numbers[POSE:]].reshape(-1, 3)
         points = self.coordinates.points(marks.anchors, self.coordinates.moved(marks.c, asked))
@@ -84,7 +84,7 @@ class Update:
         A landmark is at ``h = Rᵀ (Y − r)`` (paper B, Eqs. 3-5).
         """
         there, marks = camera or self.camera, self.landmarks
-        J = np.eye(CAMERA) if camera is None else self.camera.transport(camera)
+        J = np.eye(CAMERA) if camera is None else transport(self.camera, camera)
         change = np.zeros(len(self.covariance.P))
         if camera is not None:
             change[:CAMERA] = np.linalg.solve(J, there.minus(self.camera))
@@ -99,7 +99,7 @@ class Update:
         own = by_point @ (R.T @ self.coordinates.jacobian(marks.anchors, marks.c))
         own = np.where(seen[:, :, None], own, 0.0)
         # an error that is transported displaces the world by the same, wherever it is written
-        lever = marks.gauge @ (self.camera if self.camera.transports else there).displacement()
+        lever = marks.gauge @ displacement(self.camera if self.camera.transports else there)
         return Linearisation(self, there, J, change, z, seen, own, lever)
 
 
@@ -107,11 +107,11 @@ class Update:
 class Linearisation:
     """An update's measurements, linearised somewhere.
 
-    If the camera transports its error, a displacement of the world is N as an error at the prior, and something else as
-    one here: ``H N = B`` is not zero, and the update would measure what no pixel tells. As in the observability
-    constraint of Huang, Mourikis and Roumeliotis (IJRR 29(5), 2010) H is replaced by ``H − B A``, with ``A N = 1``;
-    theirs is the nearest to H in numbers, this in units of the prior's deviations (`Update.gauge_projector`). Where
-    rounding leaves no A, the pose moves landmarks by the prior's lever.
+    If the camera transports its error, P is written in the prior's numbers. A displacement U of the world in these
+    (`Update.gauge_part`) is none for landmarks that have moved since: ``H U = B`` is not zero, and the update would
+    measure what no pixel tells. As in the observability constraint of Huang, Mourikis and Roumeliotis (IJRR 29(5),
+    2010) H is replaced by ``H − B G``, with ``G U = 1``: theirs is the nearest to H in numbers, this in units of the
+    prior's deviations. Where rounding leaves no G, the pose moves landmarks by the prior's lever.
     """
 
     update: Update
@@ -125,21 +125,21 @@ class Linearisation:
 
     @cached_property
     def _along_the_world(self) -> tuple[Array, Array, Array | None]:
-        """H by the pose's error (3M, 6), and B (3M, 6) and A (6, 6 + 3M), which is None where B is zero."""
-        update, lever, A = self.update, self.lever, None
+        """H by the pose's error (3M, 6), and B (3M, 6) and G (6, 6 + 3M), which is None where B is zero."""
+        update, lever, G = self.update, self.lever, None
         B = (self.own @ (update.lever - lever)).reshape(-1, POSE)
         if update.camera.transports and B.any():
-            A = update.gauge_projector
-            if A is None:
+            G = update.gauge_part
+            if G is None:
                 lever = update.lever
-        return -(self.own @ lever).reshape(-1, POSE), B, A
+        return -(self.own @ lever).reshape(-1, POSE), B, G
 
     def H_times(self, X: Array) -> Array:
         """H (3M, ·) of a matrix X (6 + 3M, ·), whose rows are of the errors of pose and measured landmarks."""
-        by_pose, B, A = self._along_the_world
+        by_pose, B, G = self._along_the_world
         out = by_pose @ X[:POSE]
         out += (self.own @ X[POSE:].reshape(len(self.own), 3, -1)).reshape(out.shape)
-        return np.asarray(out if A is None else out - B @ (A @ X))
+        return np.asarray(out if G is None else out - B @ (G @ X))
 
     @cached_property
     def nu(self) -> Array:
@@ -159,28 +159,28 @@ class Linearisation:
         S[np.diag_indices(len(S))] += self.update.sigma**2
         return S
 
-    def solved(self, used: BoolArray) -> Solution:
+    def solved(self, used: BoolArray) -> Correction:
         """The update by some landmarks (mask (M,)). Raises LinAlgError if S is not positive definite."""
-        rows = np.argsort(np.repeat(~used, 3), kind="stable")
+        order = np.argsort(np.repeat(~used, 3), kind="stable")
         # of the transpose, which is in the order that LAPACK wants
-        upper, info = dpotrf(reordered(self.S, rows).T, overwrite_a=1)
+        upper, info = dpotrf(reordered(self.S, order).T, overwrite_a=1)
         if info != 0:
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
         k, inverse = 3 * np.count_nonzero(used), upper_inverse(upper).T
-        return Solution(self, used, rows[:k], rows[k:], inverse[:k, :k], inverse[k:, :k], upper[k:, k:].T)
+        return Correction(self, used, order[:k], order[k:], inverse[:k, :k], inverse[k:, :k], upper[k:, k:].T)
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class Correction:
     """The update by some of the landmarks, linearised somewhere: K of them.
 
-    With their rows a before those of the others, b, the corner L_aa of ``S = L Lᵀ`` is their own factor. The others may
-    be off by anything: nothing but their distances depends on them.
+    With their numbers a of z before those of the others, b, the corner L_aa of ``S = L Lᵀ`` is their own factor. The
+    others may be off by anything: nothing but their distances depends on them.
     """
 
     at: Linearisation
     used: BoolArray  # which landmarks (M,)
-    rows: IndexArray  # a (3K,)
+    taken: IndexArray  # a (3K,)
     others: IndexArray  # b (B,)
     L_inverse: Array  # (L⁻¹)_aa (3K, 3K), lower triangular
     beneath: Array  # (L⁻¹)_ba (B, 3K)
@@ -189,13 +189,13 @@ class Solution:
 
     def white(self, X: Array) -> Array:
         """``L_aa⁻¹ X_a`` (3K, ...) of some columns X (3M, ...)."""
-        return np.asarray(self.L_inverse @ X[self.rows])
+        return np.asarray(self.L_inverse @ X[self.taken])
 
     @cached_property
     def y(self) -> Array:
         """``S⁻¹ ν`` (3M,) of what is used alone; zero for the others."""
         y = np.zeros(len(self.at.nu))
-        y[self.rows] = self.white(self.at.nu) @ self.L_inverse
+        y[self.taken] = self.white(self.at.nu) @ self.L_inverse
         return y
 
     @property
@@ -225,7 +225,7 @@ class Solution:
         The last (n, m) is ``K (H x − F)`` with the derivatives x of the errors by those of the rig, and its field F.
         """
         at, update = self.at, self.at.update
-        V = dtrmm(1.0, self.L_inverse.T, at.HP[self.rows].T, side=1, overwrite_b=1)
+        V = dtrmm(1.0, self.L_inverse.T, at.HP[self.taken].T, side=1, overwrite_b=1)
         by_rig = at.H_times(update.covariance.by_rig[update.numbers])
         by_rig -= np.where(at.seen[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
         return V, V @ self.white(by_rig)
@@ -238,9 +238,9 @@ class Solution:
         ``Q_j⁻¹ y_j``, with covariance ``Q_j⁻¹``: the distance is ``y_jᵀ Q_j⁻¹ y_j``. Those that are not used are off by
         ``ν_b + L_bb (L⁻¹)_ba ν_a``, with covariance ``L_bb L_bbᵀ``. A landmark that is not seen has distance 0.
         """
-        used, nu, columns = self.used, self.at.nu, self.L_inverse.reshape(len(self.rows), len(self.rows) // 3, 3)
+        used, nu, columns = self.used, self.at.nu, self.L_inverse.reshape(len(self.taken), len(self.taken) // 3, 3)
         off, blocks = self.y.reshape(-1, 3).copy(), np.empty((len(used), 3, 3))
-        off[~used] = (nu[self.others] + self.rest @ (self.beneath @ nu[self.rows])).reshape(-1, 3)
+        off[~used] = (nu[self.others] + self.rest @ (self.beneath @ nu[self.taken])).reshape(-1, 3)
         blocks[used] = columns.transpose(1, 2, 0) @ columns.transpose(1, 0, 2)
         blocks[~used] = diagonal_blocks(self.rest @ self.rest.T)
         found = squared_distances(off, blocks)

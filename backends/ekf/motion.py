@@ -22,10 +22,9 @@ from functools import cached_property
 
 import numpy as np
 
-from backends.ekf.camera import prior
 from backends.ekf.covariance import CAMERA, POSE
 from slam.geometry import se3
-from slam.geometry.se3 import Array, angles, body_rate_matrix, hat, rotation
+from slam.geometry.se3 import Array, angles, body_rate_matrix, rotation
 from slam.models import EstimatorModels
 
 _ACROSS = 0.1  # numerics: sine of an angle between two axes above which it is known what is across both
@@ -48,29 +47,25 @@ class EulerCamera:
     transports: bool  # keep the error of the attitude as a turn about the world's axes, and the covariance with it
 
     @classmethod
-    def first(cls, models: EstimatorModels, consistent: bool) -> tuple[EulerCamera, Array]:
-        """Before the first prediction, with its covariance."""
-        phi = angles(CANONICAL)
-        x = np.concatenate([models.initial_pose[:3, 3], phi, np.zeros(6)])
-        camera = cls(x, models.initial_pose[:3, :3] @ CANONICAL.T, consistent)
-        return camera, camera.of_body(prior(models))
+    def first(cls, models: EstimatorModels, consistent: bool) -> EulerCamera:
+        """Before the first prediction."""
+        x = np.concatenate([models.initial_pose[:3, 3], angles(CANONICAL), np.zeros(6)])
+        return cls(x, models.initial_pose[:3, :3] @ CANONICAL.T, consistent)
 
     @cached_property
     def pose(self) -> Array:
         """``T_world_left`` (4, 4)."""
         return se3.pose(self.R_world_angles @ rotation(self.x[3:6]), self.x[:3])
 
-    def by_error(self) -> Array:
+    @property
+    def v(self) -> Array:
         """See `Camera`."""
-        J = np.zeros((POSE, POSE))
-        J[:3, 3:], J[3:, :3] = body_rate_matrix(self.x[3:6]), self.pose[:3, :3].T
-        return J
+        return self.x[6:9]
 
-    def displacement(self) -> Array:
+    @cached_property
+    def turning(self) -> Array:
         """See `Camera`."""
-        W, turn = np.eye(POSE), turning(self.R_world_angles, self.x)
-        W[:3, 3:], W[3:, 3:] = hat(self.x[:3]) @ turn, turn
-        return W
+        return np.asarray(self.pose[:3, :3] @ body_rate_matrix(self.x[3:6]))
 
     def moved(self, error: Array) -> EulerCamera:
         """See `Camera`."""
@@ -88,17 +83,6 @@ class EulerCamera:
     def minus(self, other: EulerCamera) -> Array:
         """See `Camera`."""
         return self.x - other.x
-
-    def transport(self, to: EulerCamera) -> Array:
-        """See `Camera`."""
-        J = np.eye(CAMERA)
-        if self.transports:
-            turn, before = turning(self.R_world_angles, to.x), turning(self.R_world_angles, self.x)
-            change = to.x - self.x
-            J[:3, 3:6] = -hat(change[:3]) @ before
-            J[3:6, 3:6] = np.linalg.solve(turn, before)
-            J[6:9, 3:6] = -hat(change[6:9]) @ before
-        return J
 
     def advanced(self, dt: float) -> tuple[EulerCamera, Array, Array]:
         """See `Camera`: in pieces through the angles' singularity.
@@ -127,26 +111,19 @@ class EulerCamera:
         another world. As printed, A is the derivative of f, but the covariance would shrink along turns of the world,
         which nothing measures, in every step.
         """
-        x, A = self.x.copy(), np.eye(CAMERA)
-        x[:POSE] += dt * self.x[POSE:]
+        A, x = np.eye(CAMERA), self.x.copy()
         A[:POSE, POSE:] = dt * np.eye(POSE)
+        x[:POSE] += dt * self.x[POSE:]
+        after = replace(self, x=x)
         if self.transports:
-            J, R = np.eye(CAMERA), self.R_world_angles
-            J[3:6, 3:6] = np.linalg.solve(turning(R, x), turning(R, self.x))
-            A = A @ J
-        return replace(self, x=x), A
+            A[3:6, 3:6] = np.linalg.solve(after.turning, self.turning)
+        return after, A
 
     def stopped(self) -> EulerCamera:
         """See `Camera`."""
         return replace(self, x=np.concatenate([self.x[:POSE], np.zeros(POSE)]))
 
-    def of_body(self, P: Array) -> Array:
-        """See `Camera`: of the angles φ and their rates."""
-        E = np.eye(CAMERA)
-        E[3:6, 3:6] = E[9:12, 9:12] = np.linalg.inv(body_rate_matrix(self.x[3:6]))
-        return np.asarray(E @ P @ E.T)
-
-    def facing(self, T: Array) -> tuple[EulerCamera, Array]:
+    def regular_towards(self, T: Array) -> tuple[EulerCamera, Array]:
         """See `Camera`."""
         sine = self.R_world_angles[:, 2] @ T[:3, 0]  # −sin φy
         return self.reanchored(T) if abs(sine) > math.sin(LIMIT) else (self, np.eye(CAMERA))
@@ -185,8 +162,3 @@ def body_rate_derivative(phi: Array, omega: Array) -> Array:
             [-cx * wy - sx * cy * wz, -cx * sy * wz, 0],
         ]
     )
-
-
-def turning(R_world_angles: Array, x: Array) -> Array:
-    """Derivative (3, 3) of the attitude, turned about the world's axes, by the angles φ of a camera (12,)."""
-    return np.asarray(R_world_angles @ rotation(x[3:6]) @ body_rate_matrix(x[3:6]))

@@ -4,19 +4,18 @@ In the papers' order: the innovation (`backends.ekf.innovation`), the gate, the 
 state ``x + K ν`` and its covariance ``P − K S Kᵀ`` (paper A, Eq. 11). What is kept is ``y = S⁻¹ ν``: the state changes
 by ``P Hᵀ y``. From the outside in:
 
-- `agreement` tries the prior, then the caller's guess, then (`_restarted`) a pose on which the landmarks agree. If most
+- `correction` tries the prior, the caller's guess, then (`_restarted`) a pose on which the landmarks agree. If most
   observations contradict the prediction, it is the prediction that is wrong: by more than its linearisation holds for,
   or, after an impulse that the motion model does not expect, a gap, or a stretch with hardly anything to see, by more
   than it can be. Then the camera restarts where the landmarks see it, in the same map.
 - `_agreed` refuses what so few wrong observations as pass the gate may agree on by chance.
-- `solve` updates by what the `gate` lets through, and takes in what the solution predicts after all.
+- `gated_correction` updates by what the `gate` lets through, and takes in what the solution predicts after all.
 - `_agreeing` takes out what the other measurements contradict; `_iterate` linearises until that is good enough.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -24,23 +23,21 @@ import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg.lapack import dpotrf
 
-from backends.ekf.camera import prior
+from backends.ekf.camera import from_body_axes, prior
 from backends.ekf.covariance import CAMERA, HEAD, POSE
-from backends.ekf.innovation import Linearisation, Solution, Update, diagonal_blocks
+from backends.ekf.innovation import Correction, Linearisation, Update, diagonal_blocks
 from slam.data import BoolArray
 from slam.geometry import se3
 from slam.geometry.se3 import Array
 from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, by_chance, squared_distances
+from slam.window.recovery import Search
 
-#: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
-#: further than needed does harm: it moves points to where noisy pixels want them, and claims information that is not
-#: there (drives at 0.1: four times the NEES of 1.0). A long step, or a fast camera's first, cannot do without.
+#: A step is the last where the measurements it predicts linearly are right to this share of their noise: `iterations`
+#: are made only as long as they are not, in a long step or a fast camera's first. More would do harm: they move points
+#: to where noisy pixels want them, and claim information that is not there (drives at 0.1: four times the NEES of 1.0).
 _LINEAR = 1.0
 #: Their errors together may move the pose by this share of its deviations: with a wide prior all have the same sign.
 _POSE_SHARE = 0.25
-
-#: The pose (4, 4) on which landmarks agree, if there is one.
-Search = Callable[[], "Array | None"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +50,7 @@ class Gated:
     at: Linearisation  # where they are from
 
 
-def agreement(update: Update, guess: Array | None, search: Search) -> Solution | None:
+def correction(update: Update, guess: Array | None, search: Search) -> Correction | None:
     """Solve with the prior, or where it fails the pose, that most observations agree with; None where there is none.
 
     It is linearised at the prior, then at the guess, a pose (4, 4), if there is one. Where less than a third of the
@@ -79,24 +76,24 @@ def agreement(update: Update, guess: Array | None, search: Search) -> Solution |
     return found or max(minorities, key=lambda one: one.used.sum(), default=None)
 
 
-def _restarted(update: Update, search: Search, least: int) -> Solution | None:
+def _restarted(update: Update, search: Search, least: int) -> Correction | None:
     """At the pose on which landmarks agree, if at least so many do."""
     T = search() if len(update.z) >= least else None
     if T is None:
         return None
-    before, there = update.camera.pose, update.facing(T)
+    before, there = update.camera.pose, update.regular_towards(T)
     far, turned = np.linalg.norm(T[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ T[:3, :3])
-    noise = there.camera.of_body(prior(update.measure.models, (float(far), float(turned))))
+    noise = from_body_axes(there.camera, prior(update.measure.models, (float(far), float(turned))))
     there = replace(there, covariance=there.covariance.camera_moved(np.eye(CAMERA), noise))
     with suppress(LinAlgError):
-        found = solve(gate(there, T))
+        found = gated_correction(gate(there, T))
         return found if found is not None and found.used.sum() >= least else None
     return None
 
 
-def _agreed(gated: Gated) -> Solution | None:
+def _agreed(gated: Gated) -> Correction | None:
     """What agrees with a prediction, if it is more than might agree by chance at the gate's own level."""
-    found = solve(gated)
+    found = gated_correction(gated)
     agreed = np.zeros_like(gated.used) if found is None else found.used
     if len(agreed) < MIN_OBSERVATIONS or ONE_AGREES_IN * agreed.sum() >= len(agreed):
         return found
@@ -119,7 +116,7 @@ def gate(update: Update, T: Array | None = None) -> Gated:
     return Gated(np.asarray(distances <= limits), limits, distances, at)
 
 
-def solve(gated: Gated) -> Solution | None:
+def gated_correction(gated: Gated) -> Correction | None:
     """Solve with what passed the gate and agrees; then once more with what the solution predicts after all.
 
     None where nothing is left. Raises LinAlgError where S or the pose's covariance is not positive definite, or the
@@ -127,15 +124,15 @@ def solve(gated: Gated) -> Solution | None:
     """
     found, update = _with_readmitted(gated), gated.at.update
     if found is not None:
-        faced = update.facing(found.camera.pose)
-        if faced is not update:  # the coordinates of its error are nearly singular there
-            found, update = _with_readmitted(gate(faced, found.camera.pose)), faced
+        regular = update.regular_towards(found.camera.pose)
+        if regular is not update:  # the coordinates of its error are nearly singular there
+            found, update = _with_readmitted(gate(regular, found.camera.pose)), regular
     if found is not None and dpotrf(found.pose_covariance, lower=1)[1] != 0:
         raise LinAlgError("the pose's covariance would not stay positive definite")
     return found
 
 
-def _with_readmitted(gated: Gated) -> Solution | None:
+def _with_readmitted(gated: Gated) -> Correction | None:
     """With what passed the gate, and again where the solution predicts more."""
     found = _agreeing(gated, gated.used)
     if found is not None:
@@ -145,7 +142,7 @@ def _with_readmitted(gated: Gated) -> Solution | None:
     return found
 
 
-def _agreeing(gated: Gated, used: BoolArray) -> Solution | None:
+def _agreeing(gated: Gated, used: BoolArray) -> Correction | None:
     """Solve with some landmarks (mask (M,)), and take out what the other measurements contradict, the worst first.
 
     A wrong match spoils the tests of its neighbours, so a round takes out only landmarks at least half as far off as
@@ -162,7 +159,7 @@ def _agreeing(gated: Gated, used: BoolArray) -> Solution | None:
     return None
 
 
-def _iterate(at: Linearisation, used: BoolArray) -> Solution:
+def _iterate(at: Linearisation, used: BoolArray) -> Correction:
     """An update by some landmarks (mask (M,)), first linearised as it is there, then at each solution (Gauss-Newton).
 
     One iteration is taken as it is: the papers' filter.
@@ -184,12 +181,12 @@ def _iterate(at: Linearisation, used: BoolArray) -> Solution:
     return replace(found, linear=False)
 
 
-def _linear(found: Solution) -> bool:
+def _linear(found: Correction) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
     now, update = found.at, found.at.update
     step = (found.change - now.change)[update.numbers]
-    seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
-    errors = update.predicted(found.camera, found.change) - now.z - (now.own @ seen[:, :, None])[:, :, 0]
+    as_seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
+    errors = update.pixels_from(found.camera, found.change) - now.z - (now.own @ as_seen[:, :, None])[:, :, 0]
     errors = np.where(now.seen & found.used[:, None], errors, 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False

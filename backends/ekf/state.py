@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from backends.ekf.camera import Camera, Motion
+from backends.ekf.camera import Camera, Motion, displacement, pose_by_error, transport
 from backends.ekf.covariance import HEAD, Covariance
-from backends.ekf.innovation import Solution
+from backends.ekf.innovation import Correction
 from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
@@ -40,7 +40,7 @@ class FilterState:
 
     def pose_covariance(self) -> Array:
         """Covariance (6, 6) of the pose's right perturbation."""
-        J = self.camera.by_error()
+        J = pose_by_error(self.camera)
         P = J @ self.covariance.pose @ J.T
         return np.asarray(0.5 * (P + P.T))
 
@@ -48,7 +48,7 @@ class FilterState:
         """At a later time, after a motion of the camera, which sees the landmarks of some rows (M,) then."""
         camera, J, noise = motion
         landmarks, walk = slide.walked(self.landmarks, rows, camera.pose[:3, 3])
-        covariance = self.covariance.advanced(J, noise, self.camera.by_error(), rows, walk)
+        covariance = self.covariance.advanced(J, noise, pose_by_error(self.camera), rows, walk)
         return FilterState(stamp, self.frame + 1, False, camera, landmarks, covariance)
 
     # --- landmarks join and leave ---
@@ -68,7 +68,7 @@ class FilterState:
         D = new.gauge[:, :, :3] @ R
         noise = D @ covariances @ D.transpose(0, 2, 1)
         by_rig = np.zeros((len(h), 3, self.covariance.by_rig.shape[1])) if by_rig is None else D @ by_rig
-        covariance = self.covariance.appended(new.gauge @ self.camera.displacement(), noise, by_rig)
+        covariance = self.covariance.appended(new.gauge @ displacement(self.camera), noise, by_rig)
         end = self.covariance.correlated
         landmarks = self.landmarks.select(slice(end)).joined(new).joined(self.landmarks.select(slice(end, None)))
         return replace(self, measured=True, landmarks=landmarks, covariance=covariance)
@@ -104,7 +104,7 @@ class FilterState:
 
     # --- updates ---
 
-    def corrected(self, found: Solution) -> FilterState:
+    def corrected(self, found: Correction) -> FilterState:
         """After an update.
 
         A displacement of camera and landmarks together is unobservable. What it changes in each coordinate depends on
@@ -118,7 +118,7 @@ class FilterState:
         marks = self.landmarks.moved(update.coordinates, self._parts()[0], found.change[HEAD:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise LinAlgError("the corrected state is not finite")
-        J, shift = update.camera.transport(camera), self._shift(marks, camera)
+        J, shift = transport(update.camera, camera), self._shift(marks, camera)
         covariance = update.covariance.corrected(*found.gain(), J, shift)
         if not (covariance.P.diagonal()[HEAD:] > 0).all():
             raise LinAlgError("a landmark's variance would not stay positive")
@@ -139,4 +139,4 @@ class FilterState:
     def _shift(self, marks: FilterLandmarks, camera: Camera) -> Array:
         """What is added to the errors (N, 3, 6) of landmarks that have moved, by the error of the pose."""
         change = (marks.gauge - self.landmarks.gauge)[self._parts()[0]]
-        return np.asarray(change @ camera.displacement() if camera.transports else np.zeros_like(change))
+        return np.asarray(change @ displacement(camera) if camera.transports else np.zeros_like(change))

@@ -24,14 +24,13 @@ from typing import Any
 
 import numpy as np
 
-from backends.ekf.camera import prior
 from backends.ekf.covariance import CAMERA, POSE
 from backends.ekf.filter import LandmarkFilter
 from backends.ekf.landmarks import InverseDepth
 from slam.bounds import from_options, require_not_negative
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, hat
+from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 
 
@@ -43,23 +42,7 @@ class InvariantCamera:
     v: Array  # velocity (3,) in the world [m/s]
     rate: Array  # the body's rate ω (3,) [rad/s]
     transports = True
-
-    @classmethod
-    def first(cls, models: EstimatorModels) -> tuple[InvariantCamera, Array]:
-        """Before the first prediction, with its covariance."""
-        return cls(models.initial_pose, np.zeros(3), np.zeros(3)), prior(models)
-
-    def by_error(self) -> Array:
-        """See `Camera`: ``[R̂ᵀ θ, R̂ᵀ δp]``."""
-        J = np.zeros((POSE, POSE))
-        J[:3, 3:] = J[3:, :3] = self.pose[:3, :3].T
-        return J
-
-    def displacement(self) -> Array:
-        """See `Camera`: ``ξ_p = δp + p̂ × θ``."""
-        W = np.eye(POSE)
-        W[:3, 3:] = hat(self.pose[:3, 3])
-        return W
+    turning = np.eye(3)
 
     def moved(self, error: Array) -> InvariantCamera:
         """See `Camera`."""
@@ -76,12 +59,6 @@ class InvariantCamera:
         shift = self.pose[:3, 3] - other.pose[:3, 3]
         return np.concatenate([shift, turn, self.v - other.v, self.rate - other.rate])
 
-    def transport(self, to: InvariantCamera) -> Array:
-        """See `Camera`: ``T(χ̂⁺)⁻¹ T(χ̂)``."""
-        J = np.eye(CAMERA)
-        J[:3, 3:6], J[6:9, 3:6] = hat(self.pose[:3, 3] - to.pose[:3, 3]), hat(self.v - to.v)
-        return J
-
     def advanced(self, dt: float) -> tuple[InvariantCamera, Array, Array]:
         """See `Camera`: ``R ← R Exp(ω Δt)``, ``p ← p + v Δt``, disturbed by the papers' impulses."""
         R, turn = self.pose[:3, :3], self.rate * dt
@@ -95,11 +72,7 @@ class InvariantCamera:
         """See `Camera`."""
         return replace(self, v=np.zeros(3), rate=np.zeros(3))
 
-    def of_body(self, P: Array) -> Array:
-        """See `Camera`: turns that are the same about all axes of the body are so about those of the world."""
-        return P
-
-    def facing(self, T: Array) -> tuple[InvariantCamera, Array]:
+    def regular_towards(self, T: Array) -> tuple[InvariantCamera, Array]:
         """See `Camera`: its error is regular everywhere."""
         return self, np.eye(CAMERA)
 
@@ -141,4 +114,5 @@ class IekfBackend(LandmarkFilter):
 
     def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
         self.config = from_options(IekfConfig, "iekf", options)
-        super().__init__(rig, models, *InvariantCamera.first(models), InverseDepth(), self.config.iterations)
+        first = InvariantCamera(models.initial_pose, np.zeros(3), np.zeros(3))
+        super().__init__(rig, models, first, InverseDepth(), self.config.iterations)

@@ -123,12 +123,14 @@ class Steps(RectifiedMeasurement):
             if np.linalg.eigvals(np.linalg.solve(one.information, information)).real.min() > 1:  # more than the motion
                 return _alone(s, found.T, information), nis, ""
         ratio = math.sqrt(self.stereo.f / self.models.pixel_sigma)
-        marks = s.landmarks.with_variables(seen, one.z, number, self.track, self.config.landmarks, found.T, ratio)
-        after = replace(_seeing(s), landmarks=marks, poses=np.concatenate([s.poses[:-1], found.T[None]]))
+        after = replace(_seeing(s), poses=np.concatenate([s.poses[:-1], found.T[None]]))
+        last, age = s.age(marks.pose.max(axis=1, initial=-1)), int(after.ages[-1])
+        marks = s.landmarks.with_variables(seen, last, one.z, age, self.track, self.config.landmarks, found.T, ratio)
+        after = replace(after, landmarks=marks)
         after = self._measured(after, seen, one.z, s.oldest(self.config.lag or SmootherConfig.lag, number))
         solved, why = graph.followed(after)
         after = self.settled(after, solved)
-        marks = after.landmarks.without_variables(number) if why else after.landmarks
+        marks = after.landmarks.without_variables(age) if why else after.landmarks
         return replace(after, landmarks=marks.left_behind(seen, after.poses[-1], solved.drift)), nis, why
 
     def _considered(self, s: SmootherState, one: pose_only.PoseProblem, T: Array, seen: IndexArray) -> SmootherState:
@@ -148,8 +150,10 @@ class Steps(RectifiedMeasurement):
 
     def _measured(self, s: SmootherState, rows: IndexArray, z: Array, oldest: int) -> SmootherState:
         """With measurements z (M, 3) of landmarks from the newest pose; see `SmootherLandmarks.measured`."""
-        marks = s.landmarks.measured(rows, z, s.number, self.track, oldest, s.solved)
-        sight = s.sights[-1].joined(Sight(marks.serial[rows], marks.since[rows], z))
+        marks, age = s.landmarks, int(s.ages[-1])
+        since = marks.spans(rows, s.age(marks.pose[rows].max(axis=1)), age, self.track, int(s.age(s.solved)))
+        marks = marks.measured(rows, z, s.number, since, oldest)
+        sight = s.sights[-1].joined(Sight(marks.serial[rows], since, z))
         return replace(s, landmarks=marks, sights=(*s.sights[:-1], sight))
 
     def _saw_the_same(self, s: SmootherState, serials: IdArray) -> bool:

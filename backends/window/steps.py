@@ -88,8 +88,10 @@ class Steps(RectifiedMeasurement):
         try:
             found = self._agreement(s, points, z, guess)
             s = changed(s, contradicted=found.contradicted)
-            if not found.used.any():
-                return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", ids.copy())
+            few = MIN_CONSENSUS if unknown_turn(s.relative(s.solved)) else 1  # of fewer no linearisation would hold
+            if found.used.sum() < few:
+                reason = "no observation passed the gate, or too few to tell how the camera is turned"
+                return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, ids.copy())
             return self._solved(s, found, points, ids, z)
         except np.linalg.LinAlgError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"window: the pose cannot be solved for: {error}")
@@ -181,10 +183,12 @@ class Steps(RectifiedMeasurement):
 
 
 def _lost(s: WindowState) -> bool:
-    """Whether the newest pose that measured landmarks may have turned anyhow since the problem began."""
-    i, R = 6 * s.solved, s.poses[s.solved][:3, :3]
-    enough = np.count_nonzero(s.rows.pose == s.solved) >= MIN_CONSENSUS
-    return bool(enough and unknown_turn(R @ s.covariance[i : i + 3, i : i + 3] @ R.T - s.turned))
+    """Whether the newest pose that saw landmarks may have turned anyhow since the problem began."""
+    saw = np.flatnonzero(np.bincount(s.rows.pose, minlength=len(s.frames)) >= MIN_CONSENSUS)
+    if not len(saw):
+        return False
+    i, R = 6 * saw[-1], s.poses[saw[-1], :3, :3]
+    return unknown_turn(R @ s.covariance[i : i + 3, i : i + 3] @ R.T - s.turned)
 
 
 def _seen_from_newest(s: WindowState, rows: IndexArray, by_motion: Array = _STILL) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ import numpy as np
 from slam.bodies.config import CLEAR
 from slam.data import BoolArray, IdArray, RecentPoses
 from slam.geometry.arrays import Table, changed
-from slam.geometry.se3 import Array, adjoint
+from slam.geometry.se3 import Array
 from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate
 from slam.window.marginal import marginalised
@@ -95,12 +95,6 @@ class BodyBelief:
 
     def __len__(self) -> int:
         return len(self.stamps)
-
-    @property
-    def spread(self) -> float:
-        """Standard deviation of the body's place before the camera [m]."""
-        A = adjoint(self.poses[-1])
-        return math.sqrt(max(float(np.trace((A @ self.covariance[-6:, -6:] @ A.T)[3:, 3:])), 0.0))
 
     @property
     def alive(self) -> BoolArray:

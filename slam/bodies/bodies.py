@@ -15,7 +15,7 @@ from slam.bodies.config import CLEAR, MIN_FRAMES
 from slam.bodies.track_kernels import windows_in_body
 from slam.data import BoolArray
 from slam.geometry.arrays import changed
-from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, transform, twice
+from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, so3_exp, transform, twice
 from slam.models import ObjectModels
 from slam.object_data import MovingObject
 from slam.tracks.table import Tracks
@@ -38,11 +38,10 @@ class Body:
     covariance: Array  # of the pose (6, 6), body axes
     history: Array  # poses at the window's slots (W, 4, 4)
     known: BoolArray  # at which slots there is a measured one (W,)
-    T_before: Array  # pose at the previous frame
     lower: Array  # corner (3,) of the extent of its points, body coordinates
     upper: Array  # the opposite corner
     size: float  # what it measures across at least [m]
-    seen_at: float  # when its points were last found together [s]
+    seen_at: float  # when it was last measured [s]
     velocity_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))  # of the velocity (6, 6)
     seen: int = 1  # number of frames in which it was measured
     missed: int = 0  # number of frames since it was measured
@@ -56,7 +55,6 @@ class Body:
     alike: int = 0  # number of frames in which it moved as an older body did, as a part of that would
     age: int = 0  # number of frames since it was found
     existence: float = EVEN  # probability that it exists, see `slam.bodies.belief`
-    measured_at: float = float("nan")  # when the estimate last used them [s]
     apart_from: int | None = None  # id of the body of which it is a part with a motion of its own; None for none
     distinct: frozenset[int] = frozenset()  # ids of bodies that it is known not to be a part of
     belief: BodyBelief | None = field(default=None, repr=False)  # its estimate; None where there is none yet
@@ -67,17 +65,19 @@ class Body:
         return self.certain >= PROOF and self.agreeing >= SOLID * (self.agreeing + self.against)
 
     @property
-    def unplaced(self) -> bool:
-        """Whether it may be farther from where it is expected, seen from the camera, than it is wide."""
+    def off(self) -> float:
+        """How far its corners may be from where they are expected, seen from the camera: standard deviation [m]."""
         if self.belief is None:
-            return True
-        since = np.trace((self.covariance - self.belief.estimate.covariance)[3:, 3:])
-        return bool(self.belief.spread**2 + since > self.across**2)
+            return math.inf
+        A = adjoint(self.belief.poses[-1])
+        P = A @ self.belief.covariance[-6:, -6:] @ A.T + self.covariance - self.belief.estimate.covariance
+        J = points_by_pose(np.stack([self.lower, self.upper]))
+        return math.sqrt(max(float(np.einsum("nij,jk,nik->", J, P, J)) / len(J), 0.0))
 
     @property
     def gone(self) -> bool:
-        """Whether it is out of view, and may be anywhere."""
-        return self.missed > 1 and self.unplaced
+        """Whether it is out of view, and may be farther from where it is expected than it is wide."""
+        return self.missed > 1 and self.off > self.across
 
     @property
     def solid(self) -> float:
@@ -120,8 +120,8 @@ def new_body(
     T[:3, 3] = centre
     none = np.zeros(3)
     return Body(
-        id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), T, none, none,
-        size, stamp, velocity_covariance=np.zeros((6, 6)) if uncertainty is None else uncertainty,
+        id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), none, none, size,
+        stamp, velocity_covariance=np.zeros((6, 6)) if uncertainty is None else uncertainty,
     )  # fmt: skip
 
 
@@ -134,7 +134,7 @@ def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
     R = twice(T[:3, :3].T)
     velocity = body.velocity_covariance + np.diag([angular] * 3 + [linear] * 3)
     return body.placed(
-        T, slot, False, T_before=body.T, covariance=body.covariance + dt**2 * R @ velocity @ R.T,
+        T, slot, False, covariance=body.covariance + dt**2 * R @ velocity @ R.T,
         velocity_covariance=velocity, missed=body.missed + 1, age=body.age + 1,
     )  # fmt: skip
 
@@ -148,7 +148,7 @@ def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_spe
     certain = float(v @ np.linalg.solve(P, v)) > (9.0 if body.moving else 16.8)  # χ²(6): 83 % and 99 %
     changes: dict[str, Any] = {}
     if estimate.measured:
-        changes = {"seen_at": stamp, "measured_at": stamp, "seen": body.seen + 1, "missed": 0}
+        changes = {"seen_at": stamp, "seen": body.seen + 1, "missed": 0}
     if estimate.measured and belief.since == stamp and body.belief is None:
         body = changed(body, known=np.zeros_like(body.known))  # the estimate began anew: it knows of no earlier pose
     return body.placed(
@@ -161,7 +161,7 @@ def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_spe
 def returned(body: Body, T: Array, slot: int, stamp: float) -> Body:
     """A body that is seen again, at a pose (4, 4); its estimate begins anew."""
     return body.placed(
-        T, slot, True, T_before=T, covariance=_SPREAD**2 * np.eye(6), seen_at=stamp, seen=body.seen + 1, missed=0,
+        T, slot, True, covariance=_SPREAD**2 * np.eye(6), seen_at=stamp, seen=body.seen + 1, missed=0,
         belief=None,
     )  # fmt: skip
 
@@ -169,20 +169,15 @@ def returned(body: Body, T: Array, slot: int, stamp: float) -> Body:
 def continued(body: Body, known: Body) -> Body:
     """A new body that turns out to be a known one takes over its id and predicted frame; the estimate begins anew.
 
-    The frame is shifted from the middle of the part seen before to that of the part seen now.
+    The frame is shifted from the middle of the part seen before to that of the part seen now; the extent is none yet.
     """
     frame = known.T.copy()
     frame[:3, 3] += body.middle - known.middle
-    change = inverse(body.T) @ frame
-    turn = adjoint(inverse(change))
-    corners = transform(inverse(change), np.stack([body.lower, body.upper]))
     return changed(
-        body, id=known.id, T=frame, T_before=body.T_before @ change, history=body.history @ change,
-        covariance=turn @ body.covariance @ turn.T, lower=corners.min(axis=0), upper=corners.max(axis=0),
-        certain=known.certain, existence=known.existence, evidence=known.evidence, age=known.age,
-        seen=body.seen + known.seen,
+        body, id=known.id, T=frame, history=body.history @ inverse(body.T) @ frame, certain=known.certain,
+        existence=known.existence, evidence=known.evidence, age=known.age, seen=body.seen + known.seen,
         agreeing=body.agreeing + known.agreeing, against=body.against + known.against,
-        measured_at=known.measured_at, distinct=body.distinct | known.distinct, belief=None,
+        distinct=body.distinct | known.distinct, belief=None,
     )  # fmt: skip
 
 
@@ -239,35 +234,27 @@ def in_body_axes(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> tuple[Ar
     return points, A, known
 
 
-def reported(bodies: Mapping[int, Body], tracks: Tracks) -> tuple[MovingObject, ...]:
+def reported(bodies: Mapping[int, Body], tracks: Tracks, slot: int) -> tuple[MovingObject, ...]:
     """The bodies that are worth reporting, by ascending id: if not measured, for a short while if they likely exist."""
     out = []
     for _, body in sorted(bodies.items()):
         if body.belief is None or not body.proven:
             continue
         e = body.belief.estimate
-        short = e.stamp - body.measured_at <= _UNMEASURED and body.missed <= UNMEASURED_SHARE * body.seen
+        short = e.stamp - body.seen_at <= _UNMEASURED and body.missed <= UNMEASURED_SHARE * body.seen
         if e.measured or (short and body.existence > EVEN):
-            out.append(_report(body, body.belief, tracks))
+            out.append(_report(body, body.belief, tracks, slot))
     return tuple(out)
 
 
-def _enclosing(points: Array) -> Array:
-    """Corners (2, 3) of a box about points (K, 3): percentiles widened by what they cut off evenly spread points."""
-    lower, upper = outermost(points)
-    more = CUT / (1.0 - 2.0 * CUT) * (upper - lower)
-    return np.stack([np.maximum(lower - more, points.min(axis=0)), np.minimum(upper + more, points.max(axis=0))])
-
-
-def _report(body: Body, belief: BodyBelief, tracks: Tracks) -> MovingObject:
+def _report(body: Body, belief: BodyBelief, tracks: Tracks, slot: int) -> MovingObject:
     estimate = belief.estimate
     mine = tracks.body == body.id
     rows = tracks.row[mine & tracks.found]
-    points = tracks.local[mine & tracks.sure]
     T, new = estimate.T_world_object, belief.since == estimate.stamp
-    motion = np.eye(4) if new else T @ inverse(body.T_before)
-    extent = _enclosing(points) if len(points) > 1 else np.zeros((2, 3))
+    motion = np.eye(4) if new else T @ inverse(body.history[slot - 1])
+    extent = np.stack([body.lower, body.upper])
     return MovingObject(
         body.id, np.sort(rows), estimate, motion, T @ inverse(belief.T_begun), extent, body.moving, belief.since,
-        body.measured_at, body.existence,
+        body.seen_at, body.existence,
     )  # fmt: skip

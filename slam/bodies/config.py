@@ -10,11 +10,10 @@ from slam.geometry.rig import MINIMAL_POINTS
 
 MODES = ("detect", "procedure1", "off")
 WINDOW = 12  #: cost: frames over which a feature is classified: every track keeps so many measurements
-MIN_POINTS = MINIMAL_POINTS + 1  #: points whose agreement can be tested: three agree with a pose in any case
+MIN_POINTS = MINIMAL_POINTS + 1  #: points of a new body, as three have some pose in any case
 MIN_FRAMES = 4  #: measurements from which on a feature is classified
 CLEAR = 6.0  #: χ² by which a track says for certain with which of two motions it goes: 20 to 1
 EXPLAINED = 0.2  #: share of the χ² of "still" that a motion, itself uncertain, may leave of what moves with it
-ROUNDS = 3  #: numerics: of fitting members and motion in turn
 RUN = 3  #: frames in a row that are no chance: of a common motion, without a match, of a point that disagrees
 
 

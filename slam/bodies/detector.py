@@ -138,11 +138,11 @@ class MovingObjectDetector(ObjectDetector):
             moving = finder.lasting(group, tracks, frame)
             new = finder.moving_group(frame, tracks, moving) if len(moving) else None
             if new is not None:
-                self._found(new, tracks, frame, group[0])
+                self._found(*new, tracks, group[0])
         if self.setup.config.size > 0:  # nothing gains by it where bodies are resolved, see `slam.bodies.regions`
             self._regions, moved = follow_regions(self._regions, frame, tracks)
             for region in moved:
-                self._found(finder.region_group(frame, tracks, region), tracks, frame, far=True)
+                self._found(region.rows, finder.body_of_region(frame, tracks, region), tracks, far=True)
         self._prove(tracks, frame, scenes)
         proven = of_bodies(tracks, (body for body in self.bodies.values() if body.proven))
         unproven = (tracks.body >= 0) & ~proven
@@ -153,7 +153,7 @@ class MovingObjectDetector(ObjectDetector):
         self.suspects = np.unique(suspected[suspected >= 0])
         self._begin_estimates(tracks, frame)
         self._begin_tracks(tracks, frame)
-        return self._motion_labels(tracks, frame, proven), reported(self.bodies, tracks)
+        return self._motion_labels(tracks, frame, proven), reported(self.bodies, tracks, frame.slot)
 
     def _begin(self, recent: RecentPoses | None, tracks: Tracks, features: StereoFeatures, estimate: Estimate) -> Frame:
         """Move on by a frame; nothing is followed into the first one."""
@@ -231,15 +231,14 @@ class MovingObjectDetector(ObjectDetector):
         merge(self.bodies, tracks)
 
     def _found(
-        self, group: finder.MovingGroup, tracks: Tracks, frame: Frame, whole: int | None = None, far: bool = False
+        self, members: IndexArray, body: Body, tracks: Tracks, whole: int | None = None, far: bool = False
     ) -> None:
-        """Make a body of tracks with a common twist, or continue with them one that was out of view under its id.
+        """Keep a new body of tracks `members` (K,), or continue with it one that was out of view under its id.
 
         `whole` is the body that they are a part of, with a motion of their own; `far` says that they were followed for
         farther than they are wide already.
         """
-        members = group.members
-        body = changed(group.body(self._next_body, frame, tracks), far=far)
+        body = changed(body, id=self._next_body, far=far)
         parts = {id: b for id, b in self.bodies.items() if whole is None or b.apart_from == whole}
         known = membership.reappeared(parts, body, self.setup.config.max_speed)
         if known is not None:
@@ -281,7 +280,7 @@ class MovingObjectDetector(ObjectDetector):
                 mine = np.flatnonzero((tracks.body == id) & tracks.found)
                 seen = observed(body, tracks, mine, frame.features)
                 belief = self._estimator.updated(None, id, seen, frame.cameras)
-                self.bodies[id] = changed(body, belief=belief, measured_at=frame.features.stamp)
+                self.bodies[id] = changed(body, belief=belief)
 
     def _begin_tracks(self, tracks: Tracks, frame: Frame) -> None:
         """Follow landmarks and stereo features that are not followed yet; give up what was not found for long."""

@@ -40,6 +40,7 @@ class _Seen:
     z: Array  # pixels (M, 3)
     local: Array  # where they triangulate to (M, 3)
     deep: BoolArray  # which have a depth (M,)
+    least: int  # number of known points that must agree
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,17 +64,18 @@ class BodyEstimator:
         self.gate = models.gate_probability
 
     def updated(
-        self, belief: BodyBelief | None, id: int, seen: ObjectObservations | None, cameras: RecentPoses
+        self, belief: BodyBelief | None, id: int, seen: ObjectObservations | None, cameras: RecentPoses, least: int = 1
     ) -> BodyBelief | None:
         """The belief after one more frame, the newest of the camera's `FRAMES` + 1 last poses.
 
-        A body of which nothing is known begins anew, if at least three points have a depth; else it stays None.
+        Where fewer than `least` points agree it is predicted. A body of which nothing is known begins anew, if at least
+        three points have a depth; else it stays None.
         """
         measured = after = None
         if seen is not None:
             z = self.stereo.measure(Observations(seen.points, seen.uv_left, seen.uv_right))
             local = self.stereo.triangulate(z)
-            measured = _Seen(seen, z, local, np.asarray(np.isfinite(local).all(axis=1)))
+            measured = _Seen(seen, z, local, np.asarray(np.isfinite(local).all(axis=1)), least)
         if belief is not None and len(cameras) > 1:
             with suppress(np.linalg.LinAlgError):
                 after = self._followed(belief, id, measured, cameras)
@@ -174,7 +176,7 @@ class BodyEstimator:
         )  # fmt: skip
         motion = carried(b, cameras, self.models)
         limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.gate)
-        enough = min(_LEAST, (int(b.alive.sum()) + 1) // 2)
+        enough = max(seen.least, min(_LEAST, (int(b.alive.sum()) + 1) // 2))
         while True:  # without those that disagree with the others
             if used.sum() < enough:
                 return None, ids[:0], ids

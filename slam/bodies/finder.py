@@ -27,7 +27,7 @@ from slam.bodies import membership
 from slam.bodies import scene_kernels as kernels
 from slam.bodies.belief import compact
 from slam.bodies.bodies import Body, in_body_axes, new_body
-from slam.bodies.config import MIN_FRAMES, MIN_POINTS, ROUNDS, RUN, WINDOW
+from slam.bodies.config import MIN_FRAMES, MIN_POINTS, RUN, WINDOW
 from slam.bodies.fits import constant_velocity, fit_velocities, measure, times_vectors
 from slam.bodies.frame import Frame, Setup
 from slam.bodies.regions import Region
@@ -203,40 +203,25 @@ def _classified(frame: Frame, tracks: Tracks, rows: IndexArray, body: Body | Non
     return rows, classify_scene(moved_in(body, tracks, rows, frame), place, frame.setup.config.suspect)
 
 
-@dataclass(frozen=True, eq=False)
-class MovingGroup:
-    """Tracks that move alike."""
+def moving_group(frame: Frame, tracks: Tracks, members: IndexArray) -> tuple[IndexArray, Body] | None:
+    """Those of the tracks `members` (K,) that lie together and move alike, and their body; None if too few or too far.
 
-    members: IndexArray  # their rows (K,)
-    centre: Array  # the point (3,) that the twist is about [m], world coordinates
-    twist: Array  # [ω, v] (6,) at the centre [rad/s, m/s]
-    covariance: Array  # of the twist (6, 6)
-
-    def body(self, id: int, frame: Frame, tracks: Tracks) -> Body:
-        """A new body with the group's twist, fitted to its tracks."""
-        size, stamp = frame.setup.config.size, frame.features.stamp
-        body = new_body(id, self.centre, self.twist, frame.times, stamp, size, self.covariance)
-        return membership.fitted(body, tracks, self.members, frame.slot)
-
-
-def moving_group(frame: Frame, tracks: Tracks, members: IndexArray) -> MovingGroup | None:
-    """Those of the tracks `members` (K,) that lie together and move alike; None if they are too few or too far."""
+    What lies among them and rather stands still would slow them down.
+    """
     members = members[compact(tracks.position[members])]
-    for _ in range(ROUNDS + 1):
-        if len(members) < MIN_POINTS:
+    while len(members) >= MIN_POINTS:
+        body = _with_common_twist(frame, tracks, members)
+        if not frame.resolves(body.middle):
             return None
-        group = _with_common_twist(frame, tracks, members)
-        if not frame.resolves(group.centre):
-            return None
-        moves: BoolArray = membership.membership_test(group.body(0, frame, tracks), tracks, members)[0] > 0
+        moves: BoolArray = membership.membership_test(body, tracks, members)[0] > 0
         if moves.all():
-            break
-        members = members[moves]  # what lies among them and rather stands still slows them down
-    return group
+            return members, body
+        members = members[moves]
+    return None
 
 
-def _with_common_twist(frame: Frame, tracks: Tracks, members: IndexArray) -> MovingGroup:
-    """Tracks with the twist of ``V = v + ω × r`` that fits them best over the window.
+def _with_common_twist(frame: Frame, tracks: Tracks, members: IndexArray) -> Body:
+    """The body of tracks with the twist of ``V = v + ω × r`` that fits them best over the window.
 
     A prior on ω keeps the depth noise of few, close points from turning it wildly. The present twist differs from the
     mean by what a third of the window's time allows.
@@ -250,15 +235,24 @@ def _with_common_twist(frame: Frame, tracks: Tracks, members: IndexArray) -> Mov
     covariance = np.linalg.inv((JA @ J).sum(axis=0) + np.diag(prior))
     twist = covariance @ (JA @ motion.velocity[:, :, None]).sum(axis=0)[:, 0]
     linear, angular = models.velocity_variance(-float(frame.times.min()) / 3.0)
-    return MovingGroup(members, centre, twist, covariance + np.diag([angular] * 3 + [linear] * 3))
+    return _body_of(members, centre, twist, covariance + np.diag([angular] * 3 + [linear] * 3), frame, tracks)
 
 
-def region_group(frame: Frame, tracks: Tracks, region: Region) -> MovingGroup:
-    """A followed region's tracks, with its velocity."""
+def body_of_region(frame: Frame, tracks: Tracks, region: Region) -> Body:
+    """The body of a followed region's tracks, with its velocity."""
     P = frame.setup.models.initial_angular_velocity_sigma**2 * np.eye(6)
     P[3:, 3:] = region.covariance[3:, 3:]
-    twist = np.concatenate([np.zeros(3), region.state[3:]])
-    return MovingGroup(region.rows, tracks.position[region.rows].mean(axis=0), twist, P)
+    twist, centre = np.concatenate([np.zeros(3), region.state[3:]]), tracks.position[region.rows].mean(axis=0)
+    return _body_of(region.rows, centre, twist, P, frame, tracks)
+
+
+def _body_of(
+    members: IndexArray, centre: Array, twist: Array, covariance: Array, frame: Frame, tracks: Tracks
+) -> Body:  # fmt: skip
+    """A body, without an id yet, that has a twist [ω, v] (6,) of a `covariance` (6, 6) about `centre` (3,)."""
+    size, stamp = frame.setup.config.size, frame.features.stamp
+    body = new_body(0, centre, twist, frame.times, stamp, size, covariance)
+    return membership.fitted(body, tracks, members, frame.slot)
 
 
 def parting(
@@ -267,9 +261,10 @@ def parting(
 ) -> IndexArray:  # fmt: skip
     """Those of the landmarks `at` (K,), seen as features `rows`, that part from the rest of them.
 
-    The camera was at `eyes` (W, 3) in the window's frames. Three are enough: of a body near the camera that begins to
-    move, as many of its landmarks carry the camera along. In a run's first frames single ones part, too, and however
-    many: what moves from the beginning on would else pull the camera along, and the world's axes with it.
+    The camera was at `eyes` (W, 3) in the window's frames. Three are enough, whose displacements are nine numbers: of a
+    body near the camera that begins to move, as many of its landmarks carry the camera along. In a run's first frames
+    single ones part, too, and however many: what moves from the beginning on would else pull the camera along, and the
+    world's axes with it.
     """
     t, free, slot = tracks, tracks.body[at] < 0, now % WINDOW
     at, rows = at[free], rows[free]

@@ -16,7 +16,7 @@ from slam.bodies.track_kernels import expected_pixels, inverses
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among, isin
-from slam.geometry.rig import measurement_rows
+from slam.geometry.rig import MINIMAL_POINTS, measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.object_data import ObjectObservations
 from slam.tracks import follow as features_of_tracks
@@ -115,8 +115,10 @@ def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) 
     misfits, but followed on: they may lie on a part that moves otherwise, such as a lid.
     """
     mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
-    some = mine[:0] if len(mine) < MIN_POINTS and body.unplaced else mine  # any two points agree with one of its poses
-    belief = estimator.updated(body.belief, body.id, observed(body, tracks, some, frame.features), frame.cameras)
+    # any two points agree with a pose of a body that may be half its width off, any three if it may be anywhere
+    least = MIN_POINTS if body.off > body.across else MINIMAL_POINTS if 2.0 * body.off > body.across else 1
+    seen = observed(body, tracks, mine, frame.features)
+    belief = estimator.updated(body.belief, body.id, seen, frame.cameras, least)
     rows = tracks.row[mine]
     tracks.row[mine] = -1
     if belief is None or not belief.estimate.measured:

@@ -12,8 +12,8 @@ from functools import cache
 
 import numpy as np
 
-from slam.bodies.bodies import Body, hidden, in_body_axes, with_extent
-from slam.bodies.config import CLEAR, EXPLAINED, MIN_FRAMES, ROUNDS, RUN, WINDOW
+from slam.bodies.bodies import Body, hidden, in_body_axes, of_bodies, with_extent
+from slam.bodies.config import CLEAR, EXPLAINED, MIN_FRAMES, RUN, WINDOW
 from slam.bodies.fits import fit_positions, times_vectors
 from slam.bodies.frame import Frame
 from slam.bodies.track_kernels import LEAST, RIDGE, distances_from_box, inverses, squares, weighted_means
@@ -24,6 +24,7 @@ from slam.geometry.se3 import Array, exp, points_by_pose, transform
 from slam.tracks.table import Tracks
 
 MARGIN = 0.25  # how far from a body's extent its further features may lie, as a share of the extent's diagonal
+_ROUNDS = 3  # numerics: of fitting poses and points in turn
 _OFF = 0.2  # how far a pose may be from a constant velocity, before anything is known [rad] and [m]
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join
 _LOOSE = 4.0  # times the 99 % limit that the χ² of a member may be whose motion is explained for the most part
@@ -58,7 +59,7 @@ def fitted(body: Body, tracks: Tracks, rows: IndexArray, slot: int) -> Body:
 
 def _with_poses_fitted(body: Body, tracks: Tracks, rows: IndexArray) -> Body:
     """A body with its poses over the window fitted to what tracks measured."""
-    for _ in range(ROUNDS):
+    for _ in range(_ROUNDS):
         points, A, _ = in_body_axes(body, tracks, rows)
         y = weighted_means(points, A)
         J = -points_by_pose(y)
@@ -154,12 +155,9 @@ def _expel(body: Body, tracks: Tracks) -> Array:
 
 def tracks_on_bodies(bodies: Mapping[int, Body], tracks: Tracks) -> tuple[IndexArray, IndexArray]:
     """Rows of seen tracks on a proven body, members or inside its extent, and of those that may lie on any body."""
-    seen, known = tracks.found, tracks.body >= 0
-    on = np.zeros(len(tracks), bool)
-    for body in bodies.values():
-        if body.proven:
-            on |= seen & (tracks.body == body.id)
-    near, free = seen & known & ~on, np.flatnonzero(seen & ~known & ~tracks.still)
+    on = tracks.found & of_bodies(tracks, (body for body in bodies.values() if body.proven))
+    near = tracks.found & (tracks.body >= 0) & ~on
+    free = np.flatnonzero(tracks.found & (tracks.body < 0) & ~tracks.still)
     for body in bodies.values():
         if not body.measured:
             continue

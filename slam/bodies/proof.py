@@ -11,7 +11,8 @@ frames agree, less that of the rest of the scene, is known to within
 Members also share errors of which nothing is known: a junction of two edges at different depths slides along both as
 the camera moves. Therefore the body's places in the frames of the window, or those of its ends, must lie along a way
 better than they scatter about it (an F test): a junction jumps. What the way has in common with the camera's says
-nothing, nor do members that find a right match in half of their frames only, as along a repeated pattern.
+nothing, nor do members that find a right match in half of their frames only, as along a repeated pattern. What was
+followed for far must go a way in the camera's axes, too: a bonnet, or a reflection in a windscreen, rests there.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ class Way:
     """Where a body was in the frames of the window."""
 
     places: Array  # of its middle and ends in some of them (K, 4, 3), in the world or in its whole [m]
+    in_view: Array  # the same in the camera's axes (K, 4, 3) [m]
     times: Array  # of these frames (K,) [s]
     by_rig: Array  # how far it seems to go in a frame by a disparity that is wrong by the deviation of a pixel (3,) [m]
     cameras: Array  # where the camera was in these frames (K, 3) [m]
@@ -59,12 +61,14 @@ class Way:
         seen = np.flatnonzero(known)
         seen = seen[np.argsort(stamps[seen])]
         ends = 0.5 * (body.lower + body.upper) + _ENDS * (body.upper - body.lower)
-        places = (history[seen, None, :3, :3] @ ends[:, :, None])[..., 0] + history[seen, None, :3, 3]
-        rays = places[:, 0] - cameras[seen, :3, 3]
-        depth = np.einsum("ni,ni->n", rays, cameras[seen, :3, 2])
+        cameras, history = cameras[seen], history[seen]
+        places, in_view = (
+            T[:, None, :3, 3] + ends @ np.swapaxes(T[:, :3, :3], 1, 2) for T in (history, inverse(cameras) @ history)
+        )
+        rays, depth = places[:, 0] - cameras[:, :3, 3], in_view[:, 0, 2]
         off = rays * (frame.setup.depth_noise(depth) / depth)[:, None]  # by a disparity that is wrong by sigma
         by_rig = (off[-1] - off[0]) / max(len(seen) - 1, 1)
-        return cls(places, stamps[seen], by_rig, cameras[seen, :3, 3])
+        return cls(places, in_view, stamps[seen], by_rig, cameras[:, :3, 3])
 
     @property
     def bar(self) -> float:
@@ -88,16 +92,18 @@ def with_frame(
     """The evidence that a body moves still, after one more frame, and what this frame counts for its `PROOF`.
 
     The evidence is a cumulative sum of −log10 of the chance that the weaker test gives; it fades while a body rests.
-    For a body that was followed `far`, for farther than it is wide, its way alone counts. Both cameras made the share
-    `both` of the members' measurements.
+    For a body that was followed `far`, for farther than it is wide, its way alone counts, if it goes one in the
+    camera's axes as well. Both cameras made the share `both` of the members' measurements.
     """
     says, turns, bar = _by_frames(way.places if far else way.beside_camera(), way.times), 0.0, way.bar
+    if both < _BOTH or (far and _by_frames(way.in_view, way.times) < PROVEN):
+        bar = np.inf
     if len(moved.d) < MIN_POINTS:
-        return evidence, 2 * (far and says >= bar and both >= _BOTH)
+        return evidence, 2 * (far and says >= bar)
     if not far:
         by_members, turns = _by_members(moved, scene, way.by_rig)
         says = min(says, by_members)
-    counts = 0 if both < _BOTH or says < max(0.5 * PROVEN, bar - turns) else 2 if says >= PROVEN else 1
+    counts = 0 if says < max(0.5 * PROVEN, bar - turns) else 2 if says >= PROVEN else 1
     return max(0.0, evidence + says - _ALLOWANCE), counts
 
 

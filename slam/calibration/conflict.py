@@ -11,6 +11,7 @@ import numpy as np
 
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import FOCALS, Evidence, along
+from slam.geometry.camera import off_middle
 from slam.geometry.se3 import Array
 
 #: guard: Least gain of twice the log-likelihood. With unlimited data it is the square of the error in standard
@@ -23,6 +24,26 @@ GAIN = 49.0
 FOCAL_WARNING = 16.0
 
 
+def middle_refuted(model: RigModel, mean: Array, covariance: Array, evidence: Evidence) -> bool:
+    """Whether the images are far less likely if the principal points are in their middle; see `conflict`.
+
+    `mean` (n,) is the prior's.
+    """
+    change = -mean
+    for side, camera in (("left", model.rig.left), ("right", model.rig.right)):
+        x, y = off_middle(camera) * (camera.width - 1, camera.height - 1) / 2 / (camera.fu, camera.fv)
+        change = change + x * along(model, f"{side}_cx") + y * along(model, f"{side}_cy")
+    pull, held = _of_calibration(covariance, evidence)
+    return bool(change @ held @ change - 2 * pull @ change > GAIN)
+
+
+def _of_calibration(covariance: Array, evidence: Evidence) -> tuple[Array, Array]:
+    """The likelihood of the prior's mean in information form: times the mean (n,), and the information (n, n)."""
+    information = np.linalg.inv(covariance)
+    posterior = np.linalg.inv(information + evidence.S)
+    return information @ (posterior @ evidence.e), information - information @ posterior @ information
+
+
 def conflict(model: RigModel, covariance: Array, evidence: Evidence, which: str = "", focal: float = GAIN) -> str:
     """What is wrong with a calibration, in a line; empty where no cause alone explains the images far better.
 
@@ -30,10 +51,7 @@ def conflict(model: RigModel, covariance: Array, evidence: Evidence, which: str 
     parameters less the prior's mean. A focal length is named from the gain `focal` on, other causes from `GAIN`.
     `which` says which calibration it is: "kept ", or nothing.
     """
-    whose = f"{which}calibration"
-    information = np.linalg.inv(covariance)
-    posterior = np.linalg.inv(information + evidence.S)
-    pull, held = information @ (posterior @ evidence.e), information - information @ posterior @ information
+    whose, (pull, held) = f"{which}calibration", _of_calibration(covariance, evidence)
 
     def freed(*directions: tuple[str, ...]) -> tuple[float, list[float]]:
         """Twice the log-likelihood that is gained with these parameters at any values, and the values."""

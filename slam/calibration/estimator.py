@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from slam.calibration.config import SelfCalibrationConfig
-from slam.calibration.conflict import FOCAL_WARNING, GAIN, conflict
+from slam.calibration.conflict import FOCAL_WARNING, GAIN, conflict, middle_refuted
 from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.calibration.pairs import View, match, noise_variances, pair_evidence, pair_of, parallax
 from slam.calibration.posterior import (
@@ -40,6 +40,7 @@ from slam.calibration.saved import SavedCalibration, joint_calibration
 from slam.data import CommonError, Estimate, StereoFeatures
 from slam.errors import CalibrationError, ConfigurationError
 from slam.geometry.arrays import changed
+from slam.geometry.camera import size_doubt
 from slam.geometry.rig import StereoRig, rig_difference, rig_numbers
 from slam.geometry.se3 import Array, adjoint
 from slam.interfaces import Backend, ConsideringBackend, RevisingBackend
@@ -122,11 +123,15 @@ class SelfCalibration:
 
     def _contradicted(self, focal: float) -> str:
         rows, moved = self._rows.total(), self._moved()
+        unlikely = size_doubt(self.rig.left, self.rig.right)
         if rows is None:
-            return ""
+            return unlikely
         found = rows if moved is None else rows + moved
         found = found._replace(e=found.e - found.S @ self._prior.mean)
-        return conflict(self.model, self._prior.covariances[-1], found, "kept " if self._kept else "", focal)
+        prior = self._prior.covariances[-1]
+        if unlikely and not middle_refuted(self.model, self._prior.mean, prior, found):
+            return unlikely
+        return conflict(self.model, prior, found, "kept " if self._kept else "", focal)
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Apply the present posterior to features from now on; returns the change, or None.

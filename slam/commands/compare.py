@@ -11,12 +11,11 @@ from slam import registry
 from slam.commands.run import require_no_recording
 from slam.compare.plan import CLOSED_LOOP, Plan, Trial, is_world
 from slam.compare.report import write_report
-from slam.compare.sweep import Run, check, is_done, run_jobs, sweep
+from slam.compare.sweep import check, is_done, run_jobs, sweep
 from slam.compare.tables import caution, groups, write_tables
-from slam.compare.trial import COMPLETED, RESULT
+from slam.compare.trial import Run
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
-from slam.files import read_object
 from slam.naming import count as count_of
 from slam.runtime.threads import available_cores
 from slam.settings import require_settable
@@ -99,10 +98,10 @@ def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
                 stop = trial.start + min(_TRIED, frames[trial.sequence])
                 first = replace(trial, seed=0, mode=CLOSED_LOOP, stop=stop)
                 run_jobs([(first, Path(folder), None)], 1, lambda trial: None)
-                result = read_object(Path(folder) / RESULT)
-            if result["outcome"] != COMPLETED:
+                run = Run.read(first, Path(folder))
+            if not run.completed:
                 return None
-            tried[trial.sequence] = result["milliseconds"]
+            tried[trial.sequence] = run.milliseconds
         times = tried[trial.sequence]
         spared = () if trial.mode == CLOSED_LOOP else ("read", "extract")  # a replay has no images
         a_frame = times.get("total", 0.0) - sum(times.get(stage, 0.0) for stage in spared)

@@ -15,10 +15,10 @@ from slam.outputs import Output, require_outputs
 from slam.registry import ONLINE
 from slam.run.drawing import draw_objects, with_legend
 from slam.run.options import RunOptions
-from slam.run.outputs import NAMES
 from slam.run.plots import PICTURE, plot
 from slam.run.run_data import RunData
 from slam.run.runner import run
+from slam.run.schema import FILES
 from slam.run.summary import RunRecord
 from slam.run.warm_up import compile_kernels
 from slam.sequences import open_sequence
@@ -40,7 +40,7 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     """
     require_no_recording(out)
     own = Output(out, "--out", [PICTURE, _FRAME])
-    require_outputs([own, *(Output(out / backend, "--out", NAMES) for backend in ONLINE)], (), overwrite)
+    require_outputs([own, *(Output(out / backend, "--out", list(FILES)) for backend in ONLINE)], (), overwrite)
     summaries: list[dict[str, Any]] = []
     shown: dict[bool, FrameResult] = {}  # the last frame with a body, and without one
     sequence = open_sequence(_WORLD.format(frames))

@@ -43,40 +43,30 @@ def _stop(number: int, frame: object) -> None:
     raise Stopped(number)
 
 
-class _Request(Until):
-    """Set by a signal, so that a run ends after its present frame and all files agree; a second one stops it at once.
-
-    Attributes:
-        number: the signal that set it.
-    """
-
-    number = 0
-
-    def receive(self, number: int, frame: object) -> None:
-        """A handler of signals."""
-        if self.is_set():
-            raise Stopped(number)
-        self.number = number
-        if number != signal.SIGINT:
-            self.ended = f"stopped: {signal.Signals(number).name}"
-        self.set()
-
-
 @contextmanager
 def ended_by_signals(folder: Path, record: RunRecord, live: bool = False) -> Iterator[Until]:
     """What a signal sets, so that a run has no more frames; it raises `Stopped` when the run has left its files.
 
-    Ctrl-C is how a `live` run ends, and has no further effect there. A signal's message names the run's `folder`, where
-    its `record` has a frame.
+    A second signal stops it at once. Ctrl-C is how a `live` run ends, and has no further effect there. A signal's
+    message names the run's `folder`, where its `record` has a frame.
     """
-    until = _Request()
+    until, received = Until(), list[int]()
+
+    def receive(number: int, frame: object) -> None:
+        if received:
+            raise Stopped(number)
+        received.append(number)
+        if number != signal.SIGINT:
+            until.ended = f"stopped: {signal.Signals(number).name}"
+        until.set()
+
     caught = [number for number in _SIGNALS if signal.getsignal(number) is _stop]
     for number in caught:
-        signal.signal(number, until.receive)
+        signal.signal(number, receive)
     try:
         yield until
-        if until.is_set() and not (live and until.number == signal.SIGINT):
-            raise Stopped(until.number)
+        if received and not (live and received == [signal.SIGINT]):
+            raise Stopped(received[0])
     except Stopped as stopped:
         kept = f"frames done so far are kept: `slam plot {shlex.quote(str(folder))}` draws them"
         stopped.leaves = kept if record.numbers else "no frame was done yet"

@@ -13,8 +13,8 @@ import numpy as np
 from slam.compare import tables
 from slam.compare.plan import Plan, is_world
 from slam.compare.statistics import LEVEL
-from slam.compare.sweep import Run
 from slam.compare.tables import Group
+from slam.compare.trial import Run
 from slam.files import write_text
 from slam.run.options import versions
 from slam.run.plots import drawn

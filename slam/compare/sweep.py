@@ -14,19 +14,18 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from slam import registry
 from slam.compare.plan import CLOSED_LOOP, REPLAY, SIMULATED, Plan, Trial
-from slam.compare.trial import COMPLETED, RECORDING, RESULT, config_of, keep_result, run_trial
+from slam.compare.trial import RECORDING, Run, config_of, run_trial
 from slam.errors import SlamError
 from slam.files import noting_inputs, read_object
 from slam.input.features import Rectification
 from slam.outputs import Output, require_outputs
 from slam.run.options import versions
 from slam.run.outputs import naming_folder, write_json
-from slam.run.results import DOUBTED
 from slam.sequences import open_sequence
 
 RUNS, SWEEP = "runs", "sweep.json"
@@ -35,28 +34,6 @@ RUNS, SWEEP = "runs", "sweep.json"
 NAMES = (SWEEP, f"{RUNS}/", "runs.csv", "differences.csv", "report.html")
 
 Job = tuple[Trial, Path, Path | None]  # arguments of `run_trial`
-
-
-@dataclass(frozen=True)
-class Run:
-    """A trial that has ended."""
-
-    trial: Trial
-    outcome: str  # ``"completed"``, or ``"failed: …"`` with the reason
-    metrics: dict[str, float]  # figures by key of `slam.run.results.METRICS`; none where it failed
-    milliseconds: dict[str, float]  # median per stage
-    folder: Path  # its files
-    said: tuple[str, ...] = ()  # likely cause of lost frames, doubt, warnings
-
-    @property
-    def completed(self) -> bool:
-        """Whether it came to its end."""
-        return self.outcome == COMPLETED
-
-    @property
-    def trusted(self) -> bool:
-        """Whether it came to its end, and its path is not doubted."""
-        return self.completed and not self.metrics.get(DOUBTED)
 
 
 def sweep(
@@ -86,7 +63,7 @@ def sweep(
             else:
                 jobs.append((trial, out / RUNS / trial.folder, _recording(plan, trial, out)))
         run_jobs(jobs, workers, told)
-    return [read_run(trial, out) for trial in plan.every]
+    return [Run.read(trial, out / RUNS / trial.folder) for trial in plan.every]
 
 
 def run_jobs(jobs: Sequence[Job], workers: int, told: Callable[[Trial], None]) -> None:
@@ -103,7 +80,7 @@ def run_jobs(jobs: Sequence[Job], workers: int, told: Callable[[Trial], None]) -
             if (error := future.exception()) is not None:
                 if isinstance(error, BrokenProcessPool):
                     raise error
-                keep_result(trial, folder, error)
+                Run.failed(trial, folder, error).keep()
             told(trial)
     except BrokenProcessPool as error:
         raise SlamError(
@@ -121,7 +98,7 @@ def run_jobs(jobs: Sequence[Job], workers: int, told: Callable[[Trial], None]) -
 def _begin_worker() -> None:
     """Leave interrupts to the parent, end when it is gone, however it went, and do not compete with the others.
 
-    Warnings are kept in a run's `RESULT`: here they would name neither recording nor run.
+    Warnings are kept in a `Run`: here they would name neither recording nor run.
     """
     import cv2
 
@@ -164,20 +141,6 @@ def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
     return frames
 
 
-def read_run(trial: Trial, out: Path) -> Run:
-    """A trial's outcome from its folder; raises SlamError where it is not there, or cannot be read."""
-    folder = out / RUNS / trial.folder
-    result = read_object(folder / RESULT)
-    try:
-        metrics, milliseconds = (
-            {name: float(value) for name, value in result[key].items()} for key in ("metrics", "milliseconds")
-        )
-        said = tuple(map(str, result.get("said", ())))
-        return Run(trial, str(result["outcome"]), metrics, milliseconds, folder, said)
-    except (KeyError, AttributeError, TypeError, ValueError, OverflowError) as error:
-        raise SlamError(f"{folder / RESULT}: does not say how the run ended: {error!r}") from error
-
-
 def _recording(plan: Plan, trial: Trial, out: Path) -> Path | None:
     """The file that replays take, and the first back end's closed loop leaves for them; None for the other runs."""
     given = replace(trial, backend=plan.backends[0], mode=CLOSED_LOOP)
@@ -191,11 +154,8 @@ def is_done(plan: Plan, trial: Trial, out: Path) -> bool:
     A closed loop that a replay needs, and was run without one, is not done.
     """
     try:
-        run = read_run(trial, out)
-        before = read_object(out / RUNS / trial.folder / RESULT)
+        run = Run.read(trial, out / RUNS / trial.folder)
     except SlamError:
         return False
     recording = _recording(plan, trial, out) if run.completed and trial.mode == CLOSED_LOOP else None
-    if recording is not None and not recording.is_file():
-        return False
-    return bool(before.get("versions") == versions() and before.get("trial") == json.loads(json.dumps(asdict(trial))))
+    return run.versions == versions() and (recording is None or recording.is_file())

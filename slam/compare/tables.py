@@ -15,7 +15,7 @@ import numpy as np
 
 from slam.compare.plan import Plan
 from slam.compare.statistics import Difference, difference, mean_of, reach
-from slam.compare.sweep import Run
+from slam.compare.trial import Run
 from slam.files import read_object, write_text
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import pair
@@ -91,7 +91,7 @@ class Group:
         told = {key for key, each in self.compared.items() for d in each.values() if d.verdict in ("better", "worse")}
         known = {m.key for m in self.metrics}
         judged = next((key for key in RATIOS if key in known), "")
-        return [m for m in self.metrics if m.main or m.key in told or m.key == judged]
+        return [m for m in self.metrics if "main" in m.shown or m.key in told or m.key == judged]
 
     def failures(self, backend: str) -> int:
         """Number of runs that failed."""

@@ -1,9 +1,10 @@
-"""One run of a comparison: it takes a `Trial` and leaves files in its folder."""
+"""One run of a comparison: it takes a `Trial`, and leaves a `Run` and its files in a folder."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +16,16 @@ from slam.data import FrameResult, StereoFeatures, StereoFrame
 from slam.errors import SlamError, text_of
 from slam.evaluation.association_truth import SurfacePoints
 from slam.evaluation.summary import with_truth
-from slam.files import remove_file
+from slam.files import read_object, remove_file
 from slam.geometry.se3 import Array, nearest_rotation
 from slam.geometry.stamps import frame_range, pair
 from slam.run.options import RunOptions, versions
 from slam.run.outputs import naming_folder, write_json
 from slam.run.recording import load_recording
-from slam.run.results import figures
+from slam.run.results import DOUBTED, figures
 from slam.run.run_data import RunData
-from slam.run.runner import run, run_recording
+from slam.run.runner import run as run_sequence
+from slam.run.runner import run_recording
 from slam.run.summary import RunRecord
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
@@ -36,7 +38,55 @@ _RIGHT = 3.0  # a feature so near to its landmark's true place is rightly associ
 _SAME = 1e-6  # stamps of one frame, one of them from a file, differ by less [s]
 
 
-# ---------------------------------------------------------------------------------------------------- running it
+@dataclass(frozen=True)
+class Run:
+    """A trial that has ended, as it is kept in its folder."""
+
+    trial: Trial
+    outcome: str  # `COMPLETED`, or ``"failed: …"`` with the reason
+    metrics: dict[str, float]  # figures by key of `slam.run.results.METRICS`; none where it failed
+    milliseconds: dict[str, float]  # median per stage
+    folder: Path  # its files
+    said: tuple[str, ...] = ()  # likely cause of lost frames, doubt, warnings
+    versions: dict[str, str] = field(default_factory=versions)  # by which it was run
+
+    @property
+    def completed(self) -> bool:
+        """Whether it came to its end."""
+        return self.outcome == COMPLETED
+
+    @property
+    def trusted(self) -> bool:
+        """Whether it came to its end, and its path is not doubted."""
+        return self.completed and not self.metrics.get(DOUBTED)
+
+    @classmethod
+    def failed(cls, trial: Trial, folder: Path, error: BaseException) -> Run:
+        """One that an exception ended."""
+        return cls(trial, f"failed: {type(error).__name__}: {' '.join(text_of(error).split())}", {}, {}, folder)
+
+    def keep(self) -> None:
+        """Write `RESULT`; a figure that is no number is none."""
+        known = {key: value for key, value in self.metrics.items() if np.isfinite(value)}
+        with naming_folder(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+        found = asdict(self) | {"metrics": {"completed": float(self.completed), **known}}
+        write_json(self.folder / RESULT, {name: value for name, value in found.items() if name != "folder"})
+
+    @classmethod
+    def read(cls, trial: Trial, folder: Path) -> Run:
+        """What `keep` wrote; raises SlamError where it is not there, cannot be read, or is of another trial."""
+        found = read_object(folder / RESULT)
+        if found.get("trial") != json.loads(json.dumps(asdict(trial))):  # of other settings or frames
+            raise SlamError(f"{folder / RESULT}: of another trial")
+        try:
+            metrics, milliseconds = (
+                {name: float(value) for name, value in found[key].items()} for key in ("metrics", "milliseconds")
+            )
+            said, by = tuple(map(str, found["said"])), dict(found["versions"])
+            return cls(trial, str(found["outcome"]), metrics, milliseconds, folder, said, by)
+        except (KeyError, AttributeError, TypeError, ValueError, OverflowError) as error:
+            raise SlamError(f"{folder / RESULT}: does not say how the run ended: {error!r}") from error
 
 
 def run_trial(trial: Trial, folder: Path, recording: Path | None = None) -> None:
@@ -49,30 +99,12 @@ def run_trial(trial: Trial, folder: Path, recording: Path | None = None) -> None
     for path in filter(None, (folder / RESULT, own)):
         remove_file(path)
     try:
-        keep_result(trial, folder, COMPLETED, *_run(trial, recording, folder))
+        run = _run(trial, recording, folder)
     except Exception as error:  # noqa: BLE001 (not every exception gets from a worker to the parent)
         if own is not None:
             remove_file(own)  # of half a run
-        keep_result(trial, folder, error)
-
-
-def keep_result(
-    trial: Trial,
-    folder: Path,
-    outcome: str | BaseException,
-    metrics: Mapping[str, float] | None = None,
-    milliseconds: Mapping[str, float] | None = None,
-    said: Sequence[str] = (),
-) -> None:
-    """Write how a trial ended, also where an exception ended it, and its figures; one that is no number is none."""
-    if isinstance(outcome, BaseException):
-        outcome = f"failed: {type(outcome).__name__}: {' '.join(text_of(outcome).split())}"
-    known = {key: value for key, value in (metrics or {}).items() if np.isfinite(value)}
-    found = {"completed": float(outcome == COMPLETED), **known}
-    with naming_folder(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    result = {"trial": asdict(trial), "versions": versions(), "outcome": outcome, "metrics": found}
-    write_json(folder / RESULT, result | {"milliseconds": milliseconds or {}, "said": list(said)})
+        run = Run.failed(trial, folder, error)
+    run.keep()
 
 
 def config_of(trial: Trial, sequence: StereoSequence) -> SystemConfig:
@@ -111,11 +143,8 @@ class _Simulated:
         return self._world.observations(frame.index)
 
 
-def _run(trial: Trial, recording: Path | None, out: Path) -> tuple[dict[str, float], dict[str, float], list[str]]:
-    """The whole system on the sequence, or a back end alone on recorded measurements.
-
-    Returns figures, median times of stages [ms], and what is said of the run: likely cause, doubt and warnings.
-    """
+def _run(trial: Trial, recording: Path | None, out: Path) -> Run:
+    """The whole system on the sequence, or a back end alone on recorded measurements."""
     closed, record = trial.mode == CLOSED_LOOP, RunRecord()
     if not closed and (recording is None or not recording.is_file()):
         why = "the run to be replayed failed, or lost its camera and began again"
@@ -130,7 +159,9 @@ def _run(trial: Trial, recording: Path | None, out: Path) -> tuple[dict[str, flo
     else:
         simulated = _Simulated(sequence) if trial.frontend == SIMULATED else None  # type: ignore[arg-type]
         options = replace(options, start=trial.start, stop=trial.stop, record=recording)
-        summary = run(sequence if simulated is None else simulated, options, collected.add, simulated, record=record)
+        summary = run_sequence(
+            sequence if simulated is None else simulated, options, collected.add, simulated, record=record
+        )
     if not summary["frames"]:
         raise SlamError("the run has no frame")
     times = summary.get("milliseconds", {"median": {}})
@@ -138,11 +169,9 @@ def _run(trial: Trial, recording: Path | None, out: Path) -> tuple[dict[str, flo
     milliseconds |= {"total": times["median_total"]} if milliseconds else {}
     said = [text for text in (summary["tracking"], summary["doubt"]) if text]
     said += [text for text in summary["warnings"] if text not in opening]
-    alone = [text for at, text in enumerate(said) if not any(text in before for before in said[:at])]
-    return figures(summary) | collected.figures(record, out), milliseconds, alone
-
-
-# --------------------------------------------------------------------------------- what only a comparison measures
+    alone = tuple(text for at, text in enumerate(said) if not any(text in before for before in said[:at]))
+    metrics = figures(summary) | collected.figures(record, out)
+    return Run(trial, COMPLETED, metrics, milliseconds, out, alone)
 
 
 class MapRecord:

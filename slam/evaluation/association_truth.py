@@ -17,48 +17,32 @@ class SurfacePoints:
         self._world = world
         self._points: dict[int, Array] = {}
 
-    def add(self, frame: int, ids: IdArray, uv_left: Array) -> None:
-        """Landmarks `ids` (N,) first seen at left pixels (N, 2) of this frame."""
+    def of_matches(self, frame: int, result: FrameResult) -> Array:
+        """Take in what was made of a frame; distances [px] of its matches from where their landmarks truly are.
+
+        Infinite for landmarks that were first seen on something that moves, or on nothing. First sights have none, as
+        of landmarks that came back with a place: their points are those that they show.
+        """
+        uv = result.features.uv_left
+        matched = uv[result.matched_features]
+        known = np.array([i in self._points for i in result.matched.tolist()], bool)
+        self._add(frame, result.matched[~known], matched[~known])
+        self._add(frame, result.added, uv[result.added_features])
+        local = transform(inverse(self._world.ground_truth.poses[frame]), self.positions(result.matched[known]))
+        errors = np.linalg.norm(matched[known] - self._world.rig.left.project(local), axis=1)
+        return np.where(np.isfinite(errors), errors, np.inf)
+
+    def _add(self, frame: int, ids: IdArray, uv: Array) -> None:
+        """Landmarks (N,) first seen at left pixels (N, 2) of a frame; NaN on nothing, and on what moves."""
         if not len(ids):
             return
         depth, objects = self._world.depth(frame), self._world.object_ids(frame)
-        column, row = _nearest_pixels(uv_left, depth.shape)
+        column, row = np.clip(np.rint(uv).astype(int), 0, np.array(depth.shape[::-1]) - 1).T
         still = (depth[row, column] > 0) & (objects[row, column] == 0)
-        local = self._world.rig.left.rays(uv_left) * np.where(still, depth[row, column], np.nan)[:, None]
-        points = transform(self._world.ground_truth.poses[frame], local)
-        self._points.update(zip(np.asarray(ids).tolist(), points))
+        local = self._world.rig.left.rays(uv) * np.where(still, depth[row, column], np.nan)[:, None]
+        self._points.update(zip(ids.tolist(), transform(self._world.ground_truth.poses[frame], local)))
 
     def positions(self, ids: IdArray) -> Array:
-        """Where landmarks `ids` truly are (N, 3) [m], in the world of the truth; NaN for those on no still surface,
-        and for those that were never seen.
-        """
+        """Where landmarks truly are (N, 3) [m], in the world of the truth; NaN on no still surface, and never seen."""
         nowhere = np.full(3, np.nan)
-        return np.array([self._points.get(i, nowhere) for i in np.asarray(ids).tolist()]).reshape(-1, 3)
-
-    def errors(self, frame: int, ids: IdArray, uv_left: Array) -> Array:
-        """Distances (N,) [px] of left pixels (N, 2) from where the landmarks `ids` (N,) truly are.
-
-        Infinite for landmarks that were first seen on something that moves, or on nothing; NaN for those of which this
-        is the first sight, as of landmarks that came back with a place: their points are those that it shows.
-        """
-        if not len(ids):
-            return np.zeros(0)
-        known = np.array([i in self._points for i in np.asarray(ids).tolist()])
-        self.add(frame, ids[~known], uv_left[~known])
-        points = np.array([self._points[i] for i in np.asarray(ids).tolist()])
-        expected = self._world.rig.left.project(transform(inverse(self._world.ground_truth.poses[frame]), points))
-        distance = np.linalg.norm(uv_left - expected, axis=1)
-        return np.where(known, np.where(np.isfinite(distance), distance, np.inf), np.nan)
-
-    def of_matches(self, frame: int, result: FrameResult) -> Array:
-        """Take in what was made of a frame; the `errors` of its matches but first sights, infinite ones among them."""
-        uv = result.features.uv_left
-        errors = self.errors(frame, result.matched, uv[result.matched_features])
-        self.add(frame, result.added, uv[result.added_features])
-        return errors[~np.isnan(errors)]
-
-
-def _nearest_pixels(uv: Array, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows (N,) of the pixels that hold these positions."""
-    pixels = np.rint(uv).astype(int)
-    return np.clip(pixels[:, 0], 0, shape[1] - 1), np.clip(pixels[:, 1], 0, shape[0] - 1)
+        return np.array([self._points.get(i, nowhere) for i in ids.tolist()]).reshape(-1, 3)

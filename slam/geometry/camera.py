@@ -243,7 +243,7 @@ _NOT_SQUARE = 0.03  # guard: the same that digital cameras do not have; analog v
 def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
     """What is wrong with a principal point far from the middle, or pixels that are not square; empty for neither."""
     cameras = {"left": left, "right": right}
-    shares = {side: _off_middle(camera) for side, camera in cameras.items()}
+    shares = {side: off_middle(camera) for side, camera in cameras.items()}
     every = np.concatenate(list(shares.values()))
     alike = bool(every.min() > _OFF_ALIKE or every.max() < -_OFF_ALIKE)
     for side, camera in cameras.items():
@@ -278,7 +278,7 @@ def oblong(*cameras: PinholeCamera) -> str:
             f"by the calibration the focal lengths along rows and columns differ by {100 * abs(share):.0f} %: pixels "
             "of digital cameras are square; is one mistyped, or were images scaled in one way?"
         )
-    off = np.array([_off_middle(camera) for camera in cameras])
+    off = np.array([off_middle(camera) for camera in cameras])
     for name, one, other in (("width", off[:, 0], off[:, 1]), ("height", off[:, 1], off[:, 0])):
         if np.abs(one).min() > _OFF_ALIKE and np.ptp(one) < _OFF_ALIKE and np.abs(other).max() < _OFF_ALIKE / 2:
             return (
@@ -288,7 +288,7 @@ def oblong(*cameras: PinholeCamera) -> str:
     return ""
 
 
-def _off_middle(camera: PinholeCamera) -> Array:
+def off_middle(camera: PinholeCamera) -> Array:
     """How far the principal point is from the middle of the images (2,), in halves of their width and height."""
     return np.array([2 * camera.u0 / (camera.width - 1), 2 * camera.v0 / (camera.height - 1)]) - 1
 

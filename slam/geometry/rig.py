@@ -274,8 +274,41 @@ class StereoRig:
 
     @cached_property
     def rectified(self) -> RectifiedRig:
-        """The rectified rig: itself where `is_rectified`."""
-        return rectify(self)
+        """The rectified rig: itself where `is_rectified`, else OpenCV's, with only valid pixels (no black borders).
+
+        Raises:
+            CalibrationError: the cameras look so far apart that no common rectified image is left.
+        """
+        if self.is_rectified:
+            return RectifiedRig(self, self, np.eye(3), np.eye(3))
+        import cv2
+
+        a, c, size, t = self.left, self.right, (self.width, self.height), (self.R @ self.b).reshape(3, 1)
+        if "equidistant" in (a.model, c.model) and a.model != c.model:
+            raise CalibrationError("one camera is a fisheye and the other is not: such a pair cannot be rectified")
+        fisheye = a.model == "equidistant"
+        D_left, D_right = (np.array(camera.distortion or (0.0,) * 4) for camera in (a, c))
+        stereo_rectify, options = (cv2.fisheye.stereoRectify, {}) if fisheye else (cv2.stereoRectify, {"alpha": 0})
+        try:
+            R_left, R_right, P_left, P_right, *_ = stereo_rectify(
+                a.K, D_left, c.K, D_right, size, self.R, t, flags=_ZERO_DISPARITY, **options
+            )
+        except cv2.error as error:
+            raise CalibrationError("stereo rig cannot be rectified") from error
+        f = float(P_left[0, 0])
+        if fisheye:
+            # A flat image cannot hold a fisheye's whole view: keep the middle at a useful resolution instead.
+            # 0.7: focal length of a fisheye's rectified rig: 2 · atan(0.5 / 0.7 · width / fu) of view
+            f = max(f, 0.7 * a.fu)
+            P_left[0, 2], P_left[1, 2] = (self.width - 1) / 2, (self.height - 1) / 2
+            P_right[0, 2] = P_left[0, 2]
+        if not (np.isfinite(P_left).all() and np.isfinite(P_right).all() and 0.05 * a.fu < f < 20 * a.fu):
+            reason = size_doubt(a, c) or "the two cameras share no usable view"
+            raise CalibrationError(f"stereo rig cannot be rectified: {reason}")
+        u0, v0, doffs = float(P_left[0, 2]), float(P_left[1, 2]), float(P_right[0, 2] - P_left[0, 2])
+        return RectifiedRig(
+            self, StereoRig.rectified_pair(f, u0, v0, self.baseline, self.width, self.height, doffs), R_left, R_right
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,44 +373,6 @@ class RectifiedRig:
             np.nan_to_num(uv.T, nan=-1.0).astype(np.float32, order="C").reshape(2, *u.shape) for uv in pixels
         )
         return left, right
-
-
-def rectify(rig: StereoRig) -> RectifiedRig:
-    """The rectified rig of a rig, by OpenCV's ``stereoRectify`` with only valid pixels (no black borders).
-
-    Raises:
-        CalibrationError: the cameras look so far apart that no common rectified image is left.
-    """
-    if rig.is_rectified:
-        return RectifiedRig(rig, rig, np.eye(3), np.eye(3))
-    import cv2
-
-    a, c, size, t = rig.left, rig.right, (rig.width, rig.height), (rig.R @ rig.b).reshape(3, 1)
-    if "equidistant" in (a.model, c.model) and a.model != c.model:
-        raise CalibrationError("one camera is a fisheye and the other is not: such a pair cannot be rectified")
-    fisheye = a.model == "equidistant"
-    D_left, D_right = (np.array(camera.distortion or (0.0,) * 4) for camera in (a, c))
-    stereo_rectify, options = (cv2.fisheye.stereoRectify, {}) if fisheye else (cv2.stereoRectify, {"alpha": 0})
-    try:
-        R_left, R_right, P_left, P_right, *_ = stereo_rectify(
-            a.K, D_left, c.K, D_right, size, rig.R, t, flags=_ZERO_DISPARITY, **options
-        )
-    except cv2.error as error:
-        raise CalibrationError("stereo rig cannot be rectified") from error
-    f = float(P_left[0, 0])
-    if fisheye:
-        # A flat image cannot hold a fisheye's whole view: keep the middle at a useful resolution instead.
-        # 0.7: focal length of a fisheye's rectified rig: 2 · atan(0.5 / 0.7 · width / fu) of view
-        f = max(f, 0.7 * a.fu)
-        P_left[0, 2], P_left[1, 2] = (rig.width - 1) / 2, (rig.height - 1) / 2
-        P_right[0, 2] = P_left[0, 2]
-    if not (np.isfinite(P_left).all() and np.isfinite(P_right).all() and 0.05 * a.fu < f < 20 * a.fu):
-        reason = size_doubt(a, c) or "the two cameras share no usable view"
-        raise CalibrationError(f"stereo rig cannot be rectified: {reason}")
-    u0, v0, doffs = float(P_left[0, 2]), float(P_left[1, 2]), float(P_right[0, 2] - P_left[0, 2])
-    return RectifiedRig(
-        rig, StereoRig.rectified_pair(f, u0, v0, rig.baseline, rig.width, rig.height, doffs), R_left, R_right
-    )
 
 
 def rig_numbers(rig: StereoRig) -> dict[str, float]:

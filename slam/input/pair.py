@@ -50,20 +50,9 @@ class PairGeometry:
         others = max(self.as_given, self.matches - self.as_swapped)
         return self.conclusive and most(self.as_swapped, others)
 
-    @property
-    def same(self) -> bool:
-        """Most matches are at the same place in both images."""
-        return self.conclusive and most(self.at_same_place, self.matches - self.at_same_place)
-
-    @property
-    def turned(self) -> bool:
-        """Most matches have a disparity along columns alone."""
-        return self.conclusive and most(self.along_columns, self.matches - self.along_columns)
-
-    @property
-    def rows_differ(self) -> bool:
-        """The rows of most matches differ."""
-        return self.conclusive and most(self.off_rows, self.matches - self.off_rows)
+    def mostly(self, some: int) -> bool:
+        """Whether so many are most of the matches."""
+        return self.conclusive and most(some, self.matches - some)
 
 
 class Points(NamedTuple):

@@ -61,8 +61,9 @@ class InputWarnings:
         self._last: Checksum | None = None  # of the frame before
         self._last_copy = ""  # why its right image was a copy
         self._grain_warned = False
-        for unlikely in filter(None, (baseline_doubt(rig.baseline), size_doubt(rig.left, rig.right))):
-            self._warn(unlikely, no_path=True)
+        unit, size = baseline_doubt(rig.baseline), size_doubt(rig.left, rig.right)
+        for unlikely in filter(None, (unit, size)):
+            self._warn(unlikely, no_path=unlikely == unit)  # the images show the other: `slam.calibration`
             self._pair_warned = self._partners_explained = True  # and what follows from it is not
         if not self.lines and (odd := oblong(rig.left, rig.right)):
             self._warn(odd)
@@ -158,7 +159,7 @@ class InputWarnings:
         said = ""
         if not self._pair_is_right and own.swapped:
             said = _swapped(own)
-        elif not self._pair_is_right and own.same:
+        elif not self._pair_is_right and own.mostly(own.at_same_place):
             horizon = self._rig.rectified.rig.left.fu * self._rig.baseline / NO_DISPARITY
             said = (
                 f"left and right image show the same: {own.at_same_place} of {own.matches} features have no "
@@ -166,7 +167,7 @@ class InputWarnings:
             )
         elif 4 * stereo < len(features) and not most(own.as_given, own.matches - own.as_given):
             said = self._mirrored(left, right, own)
-        if not said and (own.rows_differ or (own.shown < 1 and not self._pair_is_right)):
+        if not said and (own.mostly(own.off_rows) or (own.shown < 1 and not self._pair_is_right)):
             if self._before is None and not self._pair_is_right:
                 return  # until there is a frame before, of whose moment one of the images may be
             said = self._explained(left, right, own) or _rows_differ(own, self._rig)
@@ -188,18 +189,19 @@ class InputWarnings:
     def _explained(self, left: Points, right: Points, own: PairGeometry) -> str:
         """What makes rows agree best, where something does: another moment of one image, or the rotation's inverse."""
         rig, before = self._rig, self._before
-        tried: list[tuple[Points | None, Points | None, StereoRig, str]] = []
-        if before is not None:
-            tried.append((_points(before.left, rig), right, rig, "where right images are taken to come a frame late"))
-            tried.append((left, _points(before.right, rig), rig, "where right images are taken to come a frame early"))
+        was = (None, None) if before is None else (_points(before.left, rig), _points(before.right, rig))
+        tried = [
+            (was[0], right, rig, "where right images are taken to come a frame late"),
+            (left, was[1], rig, "where right images are taken to come a frame early"),
+        ]
         if not rig.is_rectified:
             tried.append((left, right, replace(rig, R=rig.R.T), "with the inverse of the calibration's rotation"))
         best, said = 1.0, ""
         for one, two, other, how in tried:
             with suppress(CalibrationError):
                 found = pair_geometry(other, one, two, self._rows) if one and two else PairGeometry(0)
-                share = found.off_rows / max(found.matches, 1)
-                if found.conclusive and not found.rows_differ and share < best and most(own.off_rows, found.off_rows):
+                agree, share = found.mostly(found.matches - found.off_rows), found.off_rows / max(found.matches, 1)
+                if agree and share < best and most(own.off_rows, found.off_rows):
                     best, said = share, f"{found.off_rows} of {found.matches} {how}"
         cause = f"left and right image are not of one moment ({ONE_MOMENT}), or the two cameras' K and D are exchanged"
         if "inverse" in said:
@@ -265,42 +267,42 @@ def _swapped(found: PairGeometry) -> str:
 
 def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
     left, right = rig.left, rig.right
-    plain = not (left.has_distortion or right.has_distortion or np.abs(rig.R - np.eye(3)).max() > 1e-9)
-    if found.turned:
+    lenses, share = left.has_distortion or right.has_distortion, 100 * found.shown
+    plain = not lenses and np.abs(rig.R - np.eye(3)).max() <= 1e-9
+    differ = (
+        f"rows of left and right image do not agree: {found.off_rows} of {found.matches} features are off by "
+        f"{found.row_offset:.1f} px in the median"
+    )
+    if found.mostly(found.along_columns):
         cause = "the images are turned by 90°, or the cameras stand above each other: turn both, or calibrate them so"
-    elif found.shown < 1 and plain:
+        return f"{differ}; {cause}"
+    if plain and found.shown < 1:
         fx, fy, cy = (
             f"{a:.1f} and {b:.1f}" for a, b in ((left.fu, right.fu), (left.fv, right.fv), (left.v0, right.v0))
         )
         return (
-            f"rows of left and right image show {100 * max(found.shown, 0.0):.0f} % of what rectification by focal "
-            f"lengths and principal points does to them (fx {fx}, fy {fy}, cy {cy} px): is one of them mistyped?"
+            f"rows of left and right image show {max(share, 0.0):.0f} % of what rectification by focal lengths and "
+            f"principal points does to them (fx {fx}, fy {fy}, cy {cy} px): is one of them mistyped?"
         )
-    elif plain:
-        cause = (
-            "were they rectified, as this calibration says (no distortion or rotation), and are they of one moment, or "
-            "must numbers be shifted by one?"
-        )
-    elif found.shown < 1:
-        before = "the images were rectified before, or undistorted, and are again; give the calibration after that"
-        if left.has_distortion or right.has_distortion:
-            cause = f"{before}, or leave the distortion out; or it is that of another lens, or of one camera alone"
-        else:
-            cause = f"the lenses' distortion is missing in it; or {before}"
-        if found.shown < -0.5:  # guard: between images without it, 0, and with the opposite, -1
-            cause = "is the sign of the distortion exchanged?"
+    if plain:
         return (
-            f"rows of left and right image show {100 * found.shown:.0f} % of what the calibration's "
-            f"rectification does to rows: {cause}"
+            f"{differ}; were they rectified, as this calibration says (no distortion or rotation), and are they of one "
+            "moment, or must numbers be shifted by one?"
         )
+    if found.shown >= 1:
+        return (
+            f"{differ}; check that the calibration is this camera's, at this size, that K and D of the two cameras are "
+            "not exchanged, that no image is mirrored, and that both are of one moment"
+        )
+    twice = "the images were rectified before, or undistorted, and are again; give the calibration after that"
+    if found.shown < -0.5:  # guard: between images without it, 0, and with the opposite, -1
+        cause = "is the sign of the distortion exchanged?"
+    elif lenses:
+        cause = f"{twice}, or leave the distortion out; or it is that of another lens, or of one camera alone"
     else:
-        cause = (
-            "check that the calibration is this camera's, at this size, that K and D of the two cameras are not "
-            "exchanged, that no image is mirrored, and that both are of one moment"
-        )
+        cause = f"the lenses' distortion is missing in it; or {twice}"
     return (
-        f"rows of left and right image do not agree: {found.off_rows} of {found.matches} features are off by "
-        f"{found.row_offset:.1f} px in the median; {cause}"
+        f"rows of left and right image show {share:.0f} % of what the calibration's rectification does to rows: {cause}"
     )
 
 

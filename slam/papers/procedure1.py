@@ -84,23 +84,6 @@ class ObjectDatabase:
         return cls(**{name: found[name] for name in _ARRAYS})
 
 
-@dataclass(frozen=True, eq=False)
-class ObjectMotion:
-    """The object's motion from the initial to the current scene, or why there is none."""
-
-    reason: str  # empty, or one line that says why there is no motion
-    R: Array  # ``R_2^1`` (3, 3) (step d)
-    translation: Array  # ``AA′`` (3,) [m] (step e)
-    triple: NDArray[np.intp]  # rows of the three features in the current scene (3,)
-    database: NDArray[np.intp]  # and in the database (3,)
-
-    @classmethod
-    def refused(cls, reason: str) -> ObjectMotion:
-        """No motion."""
-        none = np.zeros(0, np.intp)
-        return cls(reason, np.full((3, 3), np.nan), np.full(3, np.nan), none, none)
-
-
 def body_frame(A: Array, B: Array, C: Array) -> Array:
     """Rotation (3, 3) of the body frame of three points: columns x, y, z in world axes (paper B, Procedure 1).
 
@@ -132,48 +115,48 @@ def motion_of_triples(current: Array, initial: Array, origin: Array) -> tuple[Ar
     return R, current[0] + R @ (origin - initial[0]) - origin
 
 
+def placed(current: Array, initial: Array, origin: Array) -> Array:
+    """Pose (4, 4) of the object by three points (3, 3) in the current and initial scene [m]."""
+    R, AA = motion_of_triples(current, initial, origin)
+    return pose(R, origin + AA)
+
+
 def detect(
     features: StereoFeatures, matches: tuple[NDArray[np.intp], NDArray[np.intp]], points: Array,
     database: ObjectDatabase,
-) -> ObjectMotion:  # fmt: skip
-    """The object's motion by Procedure 1, from `matches` of the database's rows and the features' (K,) (step c).
+) -> tuple[NDArray[np.intp], str]:  # fmt: skip
+    """Three matches by which to measure the object's motion (steps a and c), or one line that says why there are none.
 
-    The three with the largest determinant (of the Hessian, the detector's response) are taken (step a); where they make
-    no frame, see `why_degenerate`, the next ones. `points` (K, 3) are the features' in world coordinates [m].
+    `matches` are rows of the database and of the features (K,), `points` (K, 3) the features' in world coordinates [m].
+    The three with the largest determinant (of the Hessian, the detector's response) are taken; where they make no
+    frame, see `why_degenerate`, the next ones. What is returned are places among the matches (3,).
     """
     known, rows = matches
+    none, reason = np.zeros(0, np.intp), ""
     if len(rows) < 3:
-        return ObjectMotion.refused(f"{len(rows)} features of the object recognised, 3 are needed")
+        return none, f"{len(rows)} features of the object recognised, 3 are needed"
     order = np.argsort(-features.response[rows], kind="stable")[:_CANDIDATES]
-    reason = ""
     for triple in sorted(combinations(range(len(order)), 3), key=lambda three: three[::-1]):  # by their weakest feature
         three = order[list(triple)]
-        current, initial = points[three], database.points[known[three]]
-        why = why_degenerate(current) or why_degenerate(initial)
+        why = why_degenerate(points[three]) or why_degenerate(database.points[known[three]])
         if not why:
-            R, AA = motion_of_triples(current, initial, database.origin)
-            return ObjectMotion("", R, AA, rows[three], known[three])
+            return three, ""
         reason = reason or why
-    return ObjectMotion.refused(reason)
+    return none, reason
 
 
 def motion_covariance(current: Array, initial: Array, origin: Array, noise: Array) -> Array:
     """Covariance (6, 6), [rotation, translation] in body axes, by the noise (3, 3, 3) [m²] of the current points."""
-    T = _placed(current, initial, origin)
+    T = placed(current, initial, origin)
     J: Array = np.empty((6, 9))
     for column in range(9):
         moved = current.copy()
         moved[column // 3, column % 3] += _STEP
-        J[:, column] = log(inverse(T) @ _placed(moved, initial, origin)) / _STEP
+        J[:, column] = log(inverse(T) @ placed(moved, initial, origin)) / _STEP
     P: Array = np.zeros((6, 6))
     for i in range(3):
         P += J[:, 3 * i : 3 * i + 3] @ noise[i] @ J[:, 3 * i : 3 * i + 3].T
     return P
-
-
-def _placed(current: Array, initial: Array, origin: Array) -> Array:
-    R, AA = motion_of_triples(current, initial, origin)
-    return pose(R, origin + AA)
 
 
 class Procedure1Detector(ObjectDetector):
@@ -209,16 +192,14 @@ class Procedure1Detector(ObjectDetector):
         known, rows = found.tracks, free[found.features]
         local = self._rig.triangulate(features.uv_left[rows], features.uv_right[rows])
         points = transform(estimate.T_world_left, local)
-        motion = detect(features, (known, rows), points, d)
+        three = detect(features, (known, rows), points, d)[0]
         moved = np.sort(tracks.ids[(tracks.ids >= 0) & isin(tracks.row, rows)])
         labels = MotionLabels(np.sort(rows), np.zeros(0, np.intp), moved)
-        if motion.reason:
+        if not len(three):
             return labels, ()
-        at = np.array([np.flatnonzero(rows == row)[0] for row in motion.triple])
-        R = estimate.T_world_left[:3, :3]
-        noise = R @ self._rig.triangulation_covariance(local[at], self._sigma) @ R.T
-        P = motion_covariance(points[at], d.points[motion.database], d.origin, noise)
-        T = pose(motion.R, d.origin + motion.translation)
+        R, current, initial = estimate.T_world_left[:3, :3], points[three], d.points[known[three]]
+        noise = R @ self._rig.triangulation_covariance(local[three], self._sigma) @ R.T
+        T, P = placed(current, initial, d.origin), motion_covariance(current, initial, d.origin, noise)
         return labels, (self._reported(labels.moving, features.stamp, T, P),)
 
     def _reported(self, rows: NDArray[np.intp], stamp: float, T: Array, P: Array) -> MovingObject:

@@ -11,7 +11,7 @@ from typing import Any
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.outputs import Output
-from slam.run.outputs import NAMES
+from slam.run.schema import FILES
 
 _MOST_FRAMES = 10**12  # of a sequence: more than any has
 _PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
@@ -40,7 +40,8 @@ class RunOptions:
     def outputs(self) -> list[Output]:
         """What the run writes."""
         files = ((self.record, "--record"), (self.save_map, "--save-map"))
-        return [Output(self.out, "--out", NAMES), *(Output(path, option) for path, option in files if path is not None)]
+        given = (Output(path, option) for path, option in files if path is not None)
+        return [Output(self.out, "--out", list(FILES)), *given]
 
 
 def parse_frames(text: str | None) -> tuple[int, int | None]:

@@ -127,8 +127,8 @@ def scale_doubt(record: RunRecord, rig: StereoRig, driving: bool = False) -> str
     A baseline that is k times too long makes path, speed and distances k times too large, and no residual shows it.
     Empty where they are possible, or too few are known.
     """
-    velocities, both, _ = _velocities(record)
-    speeds, depth = np.linalg.norm(velocities[both, 3:], axis=1), _depth(record)
+    velocities, whole, _ = _velocities(record)
+    speeds, depth = np.linalg.norm(velocities[whole, 3:], axis=1), _depth(record)
     if len(speeds) < _LEAST_CHANGES or not np.isfinite(depth):
         return ""
     apart = f"by the calibration the cameras are {rig.baseline:.3g} m apart"
@@ -148,17 +148,17 @@ def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) 
     rates do so in all frames, and a vehicle that is taken for a camera in a hand, unless the motion is known to be that
     of a vehicle. Empty where the motion is as expected.
     """
-    velocities, both, durations = _velocities(record)
+    velocities, whole, durations = _velocities(record)
     if len(velocities) < _LEAST_CHANGES + 1:
         return ""
     between = 0.5 * (durations[1:] + durations[:-1])[:, None]
     densities = np.repeat([motion.angular_acceleration, motion.acceleration], 3)
     changes = np.diff(velocities, axis=0) / (np.sqrt(between) * densities)
-    counted = changes[both[1:] & both[:-1]]
+    counted = changes[whole[1:] & whole[:-1]]
     if len(counted) < _LEAST_CHANGES:
         return ""
     if driving:
-        along = np.abs(velocities[both, 3:])
+        along = np.abs(velocities[whole, 3:])
         aside = along[(along[:, 0] > _ASIDE) & (along[:, 0] > along[:, 2]), 0]
         if len(aside) >= _LEAST_CHANGES:
             return (
@@ -166,8 +166,8 @@ def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) 
                 "median, which no vehicle does: unless the camera looks to the side, something large that moved past "
                 "was taken for the world"
             )
-    faster = np.linalg.norm(np.diff(velocities[:, 3:], axis=0), axis=1)[both[1:] & both[:-1]]
-    needs = faster / between[both[1:] & both[:-1], 0]
+    faster = np.linalg.norm(np.diff(velocities[:, 3:], axis=0), axis=1)[whole[1:] & whole[:-1]]
+    needs = faster / between[whole[1:] & whole[:-1], 0]
     torn = faster[(faster > _AT_ONCE) & (needs > max(_BRAKES, _RARE * float(np.median(needs))))]
     if len(torn):
         return (
@@ -195,14 +195,14 @@ def median_depth(features: StereoFeatures, rig: StereoRig) -> float:
 
 
 def _velocities(record: RunRecord) -> tuple[Array, BoolArray, Array]:
-    """Velocities (N, 6) between frames in the camera's axes [rad/s, m/s], whether both were measured, times [s].
+    """Velocities (N, 6) between measured frames in the camera's axes [rad/s, m/s], whether they count, times [s].
 
     Where a loop moves the path, what is between is no motion.
     """
-    measured, durations = np.array(record.measured, bool), np.diff(record.stamps)
-    poses, moved = np.array(record.poses).reshape(-1, 4, 4), np.isin(np.arange(1, len(record.poses)), record.closed)
-    both = measured[1:] & measured[:-1] & ~moved
-    return log(inverse(poses[:-1]) @ poses[1:]) / durations[:, None], both, durations
+    rows = np.flatnonzero(record.measured)
+    poses, durations = np.array(record.poses).reshape(-1, 4, 4)[rows], np.diff(np.array(record.stamps)[rows])
+    whole = np.diff(np.searchsorted(record.closed, rows, side="right")) == 0
+    return log(inverse(poses[:-1]) @ poses[1:]) / durations[:, None], whole, durations
 
 
 def _depth(record: RunRecord) -> float:

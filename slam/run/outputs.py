@@ -22,12 +22,7 @@ from slam.geometry.trajectory import tum_line
 from slam.object_data import MovingObject
 from slam.run.schema import FILES, FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, OLD_LANDMARKS, OLD_TABLE, STAGES, header
 
-FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS = map(header, (FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE))
-
 _ROWS = ("trajectory.txt", "frames.csv", "objects.csv")  # grow frame by frame
-
-#: All files that a run leaves in its folder.
-NAMES = tuple(FILES)
 
 _NUMBER = r"\s+(?:-?\d[-+.\deE]*|null)"
 _NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\s+\]")  # as json indents them; no text holds a line break
@@ -45,13 +40,13 @@ class RunFiles(ExitStack):
         self.folder = folder
         with ExitStack() as opened, naming_folder(folder):
             folder.mkdir(parents=True, exist_ok=True)
-            for name in set(NAMES).difference(_ROWS):
+            for name in set(FILES).difference(_ROWS):
                 remove_file(folder / name)
             self._trajectory, self._frames, self._objects = (
                 opened.enter_context(closing(RowFile(folder / name))) for name in _ROWS
             )
-            self._frames.write(csv_rows([FRAME_COLUMNS]))
-            self._objects.write(csv_rows([OBJECT_COLUMNS]))
+            self._frames.write(csv_rows([header(FRAME_TABLE)]))
+            self._objects.write(csv_rows([header(OBJECT_TABLE)]))
             self.enter_context(opened.pop_all())
 
     def write_frame(self, number: int, result: FrameResult, loop: int | str = "", refused: int | str = "") -> None:
@@ -88,7 +83,7 @@ class RunFiles(ExitStack):
 
         `seen` and `last_seen` say by id in how many frames each was measured, and in which the last time.
         """
-        rows: list[Sequence[Any]] = [LANDMARK_COLUMNS]
+        rows: list[Sequence[Any]] = [header(LANDMARK_TABLE)]
         upper = np.triu_indices(3)
         for i, position, covariance in zip(estimate.ids.tolist(), estimate.positions, estimate.covariances):
             values = (f"{x:.9g}" for x in (*position, *covariance[upper]))

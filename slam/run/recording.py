@@ -29,7 +29,8 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory, TruthNoise
-from slam.models import EstimatorModels, MotionModel, ObjectModels, SlideModel, models_for
+from slam.models import EstimatorModels, models_for
+from slam.settings import with_changes
 
 _HEADER = {"format": "surf-stereo-slam recording", "version": 3}
 _LARGEST = 2**32  # bytes of a file
@@ -103,18 +104,16 @@ def _recording(arrays: dict[str, np.ndarray]) -> Recording:
         raise SequenceError(f"is a recording of version {header['version']}; this one reads {_HEADER['version']}")
     kinds = _ARRAYS | {name: kind for name, kind in _OPTIONAL.items() if name in arrays}
     require_arrays(arrays, kinds, "recording", SequenceError)
-    tree, models = header["rig"], header["models"]
+    tree, models = header["rig"], with_changes(EstimatorModels(), header["models"])
     left, right = (PinholeCamera(**{**tree[s], "distortion": tuple(tree[s]["distortion"])}) for s in ("left", "right"))
     rig = StereoRig(left, right, np.array(tree["R"], float), np.array(tree["b"], float))
-    parts = {"motion": MotionModel, "slide": SlideModel, "objects": ObjectModels}
-    models |= {name: kind(**models.get(name, {})) for name, kind in parts.items()}
     models_for(header["kind"])
     if not isinstance(header["name"], str):
         raise SequenceError("its name is no text")
     truth = Trajectory(arrays["truth_stamps"], arrays["truth_poses"]) if "truth_stamps" in arrays else None
     frames = _frames(arrays, rig)
     noise = TruthNoise(**header.get("truth_noise", {}))
-    return Recording(header["name"], rig, EstimatorModels(**models), frames, truth, noise, kind=header["kind"])
+    return Recording(header["name"], rig, models, frames, truth, noise, kind=header["kind"])
 
 
 def _frames(arrays: Mapping[str, np.ndarray], rig: StereoRig) -> tuple[RecordedFrame, ...]:

@@ -7,7 +7,7 @@ and how, is in `slam.evaluation`. Whether covariances hold is judged here, for o
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,11 +31,6 @@ class Metric:
     better: str = ""  # "lower", "higher", "one" (1 is honest; both ways off is worse), or "" (neither)
     #: Where: some of "compared", "main" (in a comparison's conclusions), "run", "picture", "brief" (in that of several)
     shown: str = "compared"
-
-    @property
-    def main(self) -> bool:
-        """Whether it is one of those that a comparison's conclusions speak of."""
-        return "main" in self.shown
 
     @property
     def scale(self) -> float:
@@ -131,6 +126,7 @@ RATIOS = {
     "ratio_start": "from the start",
     "ratio_100m": "over 100 m",
 }
+_SHORT = 0.1  # [m] below which the length of a path is told in millimetres
 _MOSTLY = 0.5  # share of the truth's errors in those expected, from which it is said
 _OF_A_PATH = {"loops_closed", "path_m", "speed", "sigma_m"}
 
@@ -184,6 +180,7 @@ def facts(summary: Mapping[str, Any], brief: bool = False) -> str:
         return ""
     found = figures(summary)
     shown = [m for m in METRICS if ("brief" if brief else "picture") in m.shown and found.get(m.key)]
+    shown = [replace(m, unit="mm") if m.unit == "m" and found[m.key] < _SHORT else m for m in shown]
     words = [f"{m.label} {m.show(found[m.key])} {m.unit}".rstrip() for m in shown]
     doubt = "do not trust this path, see the run's warnings" if summary.get("doubt") else ""
     covariances = verdict_of_run(summary).partition(":" if brief else " (")[0]

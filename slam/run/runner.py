@@ -26,9 +26,9 @@ from slam.run.options import RunOptions, origin, versions
 from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
 from slam.run.outputs import RunFiles, write_json
 from slam.run.recording import RecordedFrame, Recording, save_recording
-from slam.run.replay import replay
+from slam.run.replay import Replay
 from slam.run.schema import schema
-from slam.run.summary import Replayed, RunRecord, live_frames, results_of
+from slam.run.summary import RunRecord, live_frames, results_of
 from slam.run.until import Until
 from slam.run.warm_up import warm_up
 from slam.runtime.threads import one_blas_thread
@@ -114,9 +114,9 @@ def run_recording(
     config, inside = options.config, Rectification(recording.rig)
     models = inside.models(config.models)
     backend = registry.create("backends", options.backend, inside.rig, models=models, **config.backend)
-    results = zip((f.number for f in recording), replay(recording, backend, association=config.association))
-    way = _Run(recording, options, Replayed(recording, backend), record or RunRecord(), until or Until())
-    return way.drive(results, on_frame)
+    system = Replay(recording, backend, config.association)
+    way = _Run(recording, options, system, record or RunRecord(), until or Until())
+    return way.drive(system.run(), on_frame)
 
 
 @dataclass(eq=False)
@@ -125,7 +125,7 @@ class _Run:
 
     sequence: Sequence | Recording
     options: RunOptions
-    system: StereoSlam | Replayed
+    system: StereoSlam | Replay
     record: RunRecord
     until: Until
     live: LiveFrames | None = None

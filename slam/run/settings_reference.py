@@ -38,7 +38,7 @@ class Setting:
 def settings() -> Iterator[Setting]:
     """All that a user can set: in every run, and of each front end and back end that can be loaded."""
     configs = {kind: SystemConfig.for_kind(kind) for kind in KINDS}
-    for key in leaves(configs[_FIRST].to_json()):
+    for key, _ in leaves(configs[_FIRST].to_json()):
         *path, name = key.split(".")
         if path[0] not in _PARTS and can_be_set(key):
             parts = {kind: reduce(getattr, path, config) for kind, config in configs.items()}

@@ -9,24 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from slam.data import CommonError, Estimate, FrameResult
+from slam.data import CommonError, FrameResult
 from slam.evaluation.consistency import EXACT, PIXELS_ALONE, are_covariances
 from slam.evaluation.joint_errors import JointErrors, with_newest
 from slam.evaluation.objects import ObjectScore
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory, TruthNoise
-from slam.input.features import Rectification
 from slam.input.warnings import REPEATED
-from slam.interfaces import Backend, ConsideringBackend
+from slam.interfaces import ConsideringBackend
 from slam.run.recording import Recording
+from slam.run.replay import Replay
 from slam.run.schema import STAGES
 from slam.run.truth_check import truth_doubt
 from slam.runtime.compilation import compile_clock
 from slam.sequences import Sequence
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
-from slam.third_party import checked, named_failures
 from slam.tracks.step import HIDDEN
 
 logger = logging.getLogger("slam.run")
@@ -98,30 +97,9 @@ class RunRecord:
         return Trajectory(np.array(self.stamps), np.array(self.poses).reshape(-1, 4, 4))
 
 
-@dataclass(frozen=True, eq=False)
-class Replayed:
-    """A back end that is given a recording, as the summary sees a system."""
-
-    recording: Recording
-    backend: Backend
-
-    def trajectory(self) -> Trajectory:
-        """The back end's final estimate of every frame's pose."""
-        with named_failures("the path", self.backend):
-            return Rectification(self.recording.rig).path_out(
-                checked(self.backend, "trajectory", self.backend.trajectory())
-            )
-
-    def estimate(self) -> Estimate:
-        """Pose and map with covariances."""
-        with named_failures("the estimate", self.backend):
-            estimate: Estimate = checked(self.backend, "estimate", self.backend.estimate())
-            return Rectification(self.recording.rig).estimate_out(estimate)
-
-
 def results_of(
     sequence: Sequence | Recording,
-    system: StereoSlam | Replayed,
+    system: StereoSlam | Replay,
     record: RunRecord,
     final: Trajectory,
     score: ObjectScore | None,

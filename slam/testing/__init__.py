@@ -35,8 +35,7 @@ from slam.testing import estimation, protocol
 from slam.testing.scene import MODELS, RIG, SIGMA, Factory
 
 __all__ = [
-    "BACKEND_CHECKS", "GOOD", "MODELS", "RIG", "RIGHT", "RUNS", "SIGMA", "TIERS", "Factory", "Finding", "check_backend",
-    "findings",
+    "GOOD", "MODELS", "RIG", "RIGHT", "RUNS", "SIGMA", "TIERS", "Factory", "Finding", "check_backend", "findings",
 ]  # fmt: skip
 
 Check = Callable[[Factory], None]
@@ -79,9 +78,6 @@ GOOD: Sequence[Check] = (
 
 #: The tiers by name, in the order of increasing demands.
 TIERS: dict[str, Sequence[Check]] = {"runs": RUNS, "right": RIGHT, "good": GOOD}
-
-#: Every check of the contract, in the order of increasing demands.
-BACKEND_CHECKS: Sequence[Check] = (*RUNS, *RIGHT, *GOOD)
 
 
 @dataclass(frozen=True)

@@ -90,4 +90,6 @@ def world_covariance(P: Array) -> Array:
     The landmarks are as well known in the world as the poses that saw them, which are at least that well known. The
     variance of a rotation is bounded by π²/3, that of an angle of which nothing is known.
     """
-    return P / max(1.0, float(np.linalg.eigvalsh(P[:3, :3]).max()) / _ANY_TURN)
+    share = np.ones(6)
+    share[:3] /= max(1.0, np.sqrt(np.linalg.eigvalsh(P[:3, :3]).max() / _ANY_TURN))
+    return np.asarray(share[:, None] * P * share)

@@ -21,7 +21,8 @@ from slam.errors import ConfigurationError, UnknownNameError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import so3_exp
 from slam.naming import unknown
-from slam.worlds.options import FAULTS, IMAGING, OBSERVATION, RECORDING, Option, option_table, parse_query
+from slam.query import read_query
+from slam.worlds.options import COMMON, FAULTS, IMAGING, OBSERVATION, RECORDING, Option
 from slam.worlds.scenes import SCENES, assemble
 from slam.worlds.sequence import Masks, WorldSequence
 from slam.worlds.world import Scene, World
@@ -50,7 +51,7 @@ def open_world(text: str, read_masks: Callable[[str, StereoRig], Masks] | None =
     """
     text = text.removeprefix("synthetic:")
     name, _, query = text.partition("?")
-    values = parse_query(name, query, options(name))
+    values = values_of(name, query)
     key = tuple(sorted((k, v) for k, v in values.items() if k not in _RECORDING_ONLY))
     world = _build(name, key)
     told, recorded = world.rig, world
@@ -70,7 +71,15 @@ def open_world(text: str, read_masks: Callable[[str, StereoRig], Masks] | None =
 def options(name: str) -> dict[str, Option]:
     """All options of a world by name; raises UnknownNameError."""
     scene = _scene(name)
-    return option_table(scene.options, scene.defaults)
+    common = (replace(o, default=type(o.default)(scene.defaults.get(o.name, o.default))) for o in COMMON)
+    return {o.name: o for o in (*scene.options, *common)}
+
+
+def values_of(name: str, query: str) -> dict[str, Any]:
+    """The values of all options of a world; errors as of `open_world`."""
+    table = options(name)
+    texts = read_query(query, f"world {name}", table)
+    return {key: o.parse(texts[key]) if key in texts else o.default for key, o in table.items()}
 
 
 def describe(name: str) -> str:
@@ -95,8 +104,7 @@ def _scene(name: str) -> Scene:
 @lru_cache(maxsize=8)
 def _build(name: str, key: tuple[tuple[str, Any], ...]) -> World:
     """A world, kept for the next recording of it: Monte-Carlo runs differ in `seed` alone."""
-    scene = _scene(name)
-    return assemble(name, scene, dict(key), scene.build(dict(key)))
+    return assemble(name, _scene(name), dict(key))
 
 
 def describe_common() -> str:

@@ -156,10 +156,13 @@ def around_blocks(layout: int) -> Trajectory:
     rng = np.random.default_rng([layout, 47])
     aside = 0.15 * sway(stamps, rng, 0.03, 0.15)
     across = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-    height = EYE + 0.01 * sway(stamps, rng, 0.8, 2)
-    positions = np.column_stack([way + aside[:, None] * across, height])
-    pitch, roll = 0.003 * sway(stamps, rng, 0.8, 2), 0.002 * sway(stamps, rng, 0.8, 2)
-    return Trajectory(stamps, camera_poses(positions, yaw, pitch, roll))
+    return Trajectory(stamps, in_a_car(way + aside[:, None] * across, yaw, stamps, rng))
+
+
+def in_a_car(xy: Array, yaw: Array, stamps: Array, rng: np.random.Generator) -> Array:
+    """Camera poses (N, 4, 4) at level places (N, 2) [m] and headings (N,) [rad], shaken at times `stamps` [s]."""
+    positions = np.column_stack([xy, EYE + 0.01 * sway(stamps, rng, 0.8, 2)])
+    return camera_poses(positions, yaw, 0.003 * sway(stamps, rng, 0.8, 2), 0.002 * sway(stamps, rng, 0.8, 2))
 
 
 def _way() -> Array:

@@ -20,8 +20,6 @@ from slam.worlds.sequence import WorldSequence
 #: Folder in which a recording is written.
 FOLDER = "mav0"
 
-_CAMERAS = ("cam0", "cam1")
-
 
 def write_euroc(
     sequence: object, folder: str | Path, start: int = 0, stop: int | None = None,
@@ -43,8 +41,7 @@ def write_euroc(
     if os.path.lexists(root):
         raise SequenceError(f"{root}: exists already; choose another folder")
     try:
-        _write_tables(sequence, root, slice(first, last))
-        _write_images(sequence, root, range(first, last), progress)
+        _write(sequence, root, range(first, last), progress)
     except OSError as error:
         raise SequenceError(f"{root}: cannot be written: {error.strerror or error}") from error
     return root
@@ -58,33 +55,29 @@ def require_world(sequence: object) -> WorldSequence:
     return sequence
 
 
-def _write_tables(sequence: WorldSequence, root: Path, frames: slice) -> None:
-    """Calibrations and path, before the images, so that a folder cut short is still readable."""
-    rig, truth = sequence.rig, sequence.ground_truth
-    cameras = (rig.left, np.eye(4)), (rig.right, inverse(rig.T_right_left))
-    for name, (camera, T_body_camera) in zip(_CAMERAS, cameras):
-        (root / name / "data").mkdir(parents=True)
+def _write(sequence: WorldSequence, root: Path, frames: range, progress: Callable[[int], None] | None) -> None:
+    """Calibrations and path come before the images, and lists grow with them: a folder cut short is still readable."""
+    rig, poses = sequence.rig, (np.eye(4), inverse(sequence.rig.T_right_left))
+    cameras, truth = [root / "cam0", root / "cam1"], sequence.ground_truth
+    for folder, camera, T_body_camera in zip(cameras, (rig.left, rig.right), poses):
+        (folder / "data").mkdir(parents=True)
         text = _camera_text(camera, T_body_camera, float(sequence.values["rate"]))
-        (root / name / "sensor.yaml").write_text(text, encoding="utf-8")
-    (root / "state_groundtruth_estimate0").mkdir()
-    path = Trajectory(truth.stamps[frames], truth.poses[frames])
-    path.write_euroc(root / "state_groundtruth_estimate0" / "data.csv")
+        (folder / "sensor.yaml").write_text(text, encoding="utf-8")
+    state = root / "state_groundtruth_estimate0"
+    state.mkdir()
+    Trajectory(truth.stamps[frames], truth.poses[frames]).write_euroc(state / "data.csv")
     (root / "world.txt").write_text(f"synthetic:{sequence.name}\n", encoding="utf-8")
-
-
-def _write_images(sequence: WorldSequence, root: Path, frames: range, progress: Callable[[int], None] | None) -> None:
-    """Images with their lists, which grow with them."""
     with ExitStack() as stack:
-        tables = [stack.enter_context((root / name / "data.csv").open("w", encoding="ascii")) for name in _CAMERAS]
+        tables = [stack.enter_context((folder / "data.csv").open("w", encoding="ascii")) for folder in cameras]
         for table in tables:
             table.write("#timestamp [ns],filename\n")
         for done, k in enumerate(frames, start=1):
             frame = sequence.frame(k)
-            name = f"{round(frame.stamp * 1e9)}.png"
-            for camera, table, image in zip(_CAMERAS, tables, (frame.left, frame.right)):
+            stamp = round(frame.stamp * 1e9)
+            for folder, table, image in zip(cameras, tables, (frame.left, frame.right)):
                 if image is not None:
-                    write_png(root / camera / "data" / name, image)
-                    table.write(f"{name.removesuffix('.png')},{name}\n")
+                    write_png(folder / "data" / f"{stamp}.png", image)
+                    table.write(f"{stamp},{stamp}.png\n")
                     table.flush()
             if progress is not None:
                 progress(done)

@@ -64,10 +64,7 @@ def visible_landmarks(world: World, frame: int) -> VisibleLandmarks:
     landmarks = world.landmarks.select(near)
     positions = turned(landmarks.positions, landmarks.object, bodies) + bodies[landmarks.object, :3, 3]
     points = (positions - T[:3, 3]) @ T[:3, :3]
-    (nearest, farthest), camera, (x, y, z) = world.reach, world.rig.left, points.T
-    widest = 1.3 * max(camera.u0, camera.width - camera.u0) / camera.fu
-    highest = 1.3 * max(camera.v0, camera.height - camera.v0) / camera.fv
-    rows = np.flatnonzero((z > nearest) & (z < farthest) & (np.abs(x) < widest * z) & (np.abs(y) < highest * z))
+    rows = np.flatnonzero((points[:, 2] > world.reach[0]) & (points[:, 2] < world.reach[1]))
     offsets = positions[rows] - T[:3, 3]
     normals = turned(landmarks.normals[rows], landmarks.object[rows], bodies)
     facing = -(normals * offsets).sum(axis=1) > FACING * np.linalg.norm(offsets, axis=1)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from slam.data import BoolArray
 from slam.errors import ConfigurationError
-from slam.query import number, read_query, word
+from slam.query import number, word
 
 
 @dataclass(frozen=True)
@@ -86,22 +86,6 @@ FAULTS = (
 )
 
 COMMON = (*RECORDING, *OBSERVATION, *IMAGING, *FAULTS)
-
-
-def option_table(own: Iterable[Option], defaults: Mapping[str, Any]) -> dict[str, Option]:
-    """Options of one world by name: its own, and the common ones with its own defaults."""
-    common = (replace(o, default=type(o.default)(defaults.get(o.name, o.default))) for o in COMMON)
-    return {o.name: o for o in (*own, *common)}
-
-
-def parse_query(world: str, query: str, table: Mapping[str, Option]) -> dict[str, Any]:
-    """Values of all options of a world, from the text after the question mark.
-
-    Raises:
-        ConfigurationError: a key is unknown or stands twice, or a value has a wrong type or lies outside its range.
-    """
-    texts = read_query(query, f"world {world}", table)
-    return {name: o.parse(texts[name]) if name in texts else o.default for name, o in table.items()}
 
 
 def faulty_frames(values: Mapping[str, Any], frames: int, seed: int) -> dict[str, BoolArray]:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache, partial
 from statistics import NormalDist
 from typing import Any
 
 import cv2
 import numpy as np
 
-from slam.data import BoolArray, StereoFrame
 from slam.geometry.camera import PinholeCamera
-from slam.geometry.se3 import Array, inverse
+from slam.geometry.se3 import inverse
 from slam.worlds.painting import paint
 from slam.worlds.raster import Ripmap, View, draw, place, shown
 from slam.worlds.world import World
@@ -23,42 +22,30 @@ _SUPERSAMPLE = 2  # samples per pixel along each axis
 _SKY = (230, 225, 220)  # where no surface is, BGR
 
 
-class Recorder:
-    """Renders the frames of a world, with the faults of each; every frame's noise has a seed of its own."""
+def record(world: World, values: Mapping[str, Any], frame: int, right: bool, black: bool) -> list[np.ndarray]:
+    """The left image of a frame of a world, and its `right` one; every frame's noise has a seed of its own."""
+    cameras = [(world.rig.left, np.eye(4)), (world.rig.right, inverse(world.rig.T_right_left))][: 1 + right]
+    bodies, images = world.T_world_body(frame), []
+    sky = _SKY if values["colour"] else (round(float(np.mean(_SKY))),)
+    for stream, (camera, T_left_camera) in enumerate(cameras, start=2):
+        lens, pose = Lens.of(camera, _SUPERSAMPLE), world.T_world_left[frame] @ T_left_camera
+        samples = draw(world.drawn[1], partial(_ripmap, world, values["colour"]), bodies, pose, lens.view, sky)
+        rng = np.random.default_rng([values["seed"], frame, stream])
+        images.append(sense(lens.expose(samples), values, black, rng))
+    return images
 
-    def __init__(self, world: World, values: Mapping[str, Any], faults: Mapping[str, BoolArray]) -> None:
-        self._world, self._values, self._faults = world, values, faults
 
-    def record(self, frame: int, index: int, stamp: float) -> StereoFrame:
-        """The images of one frame of the world, as frame `index` of the recording."""
-        left, right = self._shoot(frame, self._lenses[0], np.eye(4), 2), None
-        if not self._faults["dropright"][frame]:
-            right = self._shoot(frame, self._lenses[1], inverse(self._world.rig.T_right_left), 3)
-        return StereoFrame(index, stamp, left, right)
-
-    def _shoot(self, frame: int, lens: Lens, T_left_camera: Array, stream: int) -> np.ndarray:
-        bodies, T_world_camera = self._world.T_world_body(frame), self._world.T_world_left[frame] @ T_left_camera
-        sky = _SKY if self._values["colour"] else (round(float(np.mean(_SKY))),)
-        image = lens.expose(draw(self._world.drawn[1], self._ripmap, bodies, T_world_camera, lens.view, sky))
-        rng = np.random.default_rng([self._values["seed"], frame, stream])
-        return sense(image, self._values, self._faults["black"][frame], rng)
-
-    @cached_property
-    def _lenses(self) -> tuple[Lens, Lens]:
-        return Lens.of(self._world.rig.left, _SUPERSAMPLE), Lens.of(self._world.rig.right, _SUPERSAMPLE)
-
-    def _ripmap(self, rectangle: int) -> Ripmap:
-        """The texture of a rectangle drawn, painted when first seen; the last ones are kept with the world."""
-        texture, painted = self._world.drawn[0][rectangle].texture, self._world.painted
-        key = (texture, self._values["colour"])
-        found: Ripmap | None = painted.pop(key, None)
-        if found is None:
-            picture = paint(texture, self._world.texels)
-            found = Ripmap(picture if self._values["colour"] else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
-            if len(painted) >= _PAINTED:
-                del painted[next(iter(painted))]
-        painted[key] = found  # at the end: what has not been seen for the longest time comes first
-        return found
+def _ripmap(world: World, colour: int, rectangle: int) -> Ripmap:
+    """The texture of a rectangle drawn, painted when first seen; the last ones are kept with the world."""
+    texture = world.drawn[0][rectangle].texture
+    found: Ripmap | None = world.painted.pop((texture, colour), None)
+    if found is None:
+        picture = paint(texture, world.texels)
+        found = Ripmap(picture if colour else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+        if len(world.painted) >= _PAINTED:
+            del world.painted[next(iter(world.painted))]
+    world.painted[texture, colour] = found  # at the end: what has not been seen for the longest time comes first
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +57,7 @@ class Lens:
     supersample: int  # samples per pixel along each axis
 
     @classmethod
+    @lru_cache(maxsize=4)
     def of(cls, camera: PinholeCamera, supersample: int) -> Lens:
         """The lens of a camera. A sample's centre is at ((i + ½) / supersample − ½) pixels."""
         s = supersample

@@ -11,7 +11,7 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import so3_exp
 from slam.worlds import indoors, streets, traffic
-from slam.worlds.geometry import Parts, place_landmarks
+from slam.worlds.geometry import place_landmarks
 from slam.worlds.options import Option
 from slam.worlds.paths import CAMERAS
 from slam.worlds.world import Scene, World
@@ -73,9 +73,9 @@ SCENES = {
 }  # fmt: skip
 
 
-def assemble(name: str, scene: Scene, values: Mapping[str, Any], parts: Parts) -> World:
-    """A world from its parts, with its landmarks chosen."""
-    rng = np.random.default_rng([values["layout"], 31])
+def assemble(name: str, scene: Scene, values: Mapping[str, Any]) -> World:
+    """A world from a scene's parts, with its landmarks chosen."""
+    parts, rng = scene.build(values), np.random.default_rng([values["layout"], 31])
     landmarks = place_landmarks(parts.rectangles, values["density"], rng, scene.alike)
     objects = np.zeros((0, len(parts.stamps), 4, 4)) if parts.objects is None else parts.objects
     focal, usual = _FOCAL[scene.kind]

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +18,6 @@ from slam.naming import sequence_line
 from slam.worlds.observe import Appearance, SimulatedFeatures, appearance, simulate
 from slam.worlds.options import faulty_frames
 from slam.worlds.world import World
-
-if TYPE_CHECKING:
-    from slam.worlds.recorder import Recorder
-
 
 Masks = tuple[BoolArray | None, BoolArray | None]  #: of both cameras (H, W), see `slam.data.StereoFrame`
 
@@ -87,8 +82,12 @@ class WorldSequence:
         k = require_frame(self.name, k, len(self))
         if self._images:
             return self._images[k]
-        frame = self._recorder.record(self.source(k), k, float(self.stamps[k]))
-        return replace(frame, left_mask=self.masks[0], right_mask=self.masks[1])
+        from slam.worlds.recorder import record  # with OpenCV
+
+        source = self.source(k)
+        right, black = not self.faults["dropright"][source], bool(self.faults["black"][source])
+        left, *rest = record(self.world, self.values, source, right, black)
+        return StereoFrame(k, float(self.stamps[k]), left, rest[0] if rest else None, *self.masks)
 
     __getitem__ = frame
 
@@ -122,13 +121,6 @@ class WorldSequence:
     @cached_property
     def _looks(self) -> Appearance:
         return appearance(self.world, self.values)
-
-    @cached_property
-    def _recorder(self) -> Recorder:
-        """What makes the images; loaded with OpenCV when the first one is asked for."""
-        from slam.worlds.recorder import Recorder
-
-        return Recorder(self.world, self.values, self.faults)
 
     def _truth(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         from slam.worlds.recorder import truth_images

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from slam.geometry.se3 import Array
-from slam.worlds.drives import EYE, PACE, STEP, Road, interpolated
+from slam.worlds.drives import EYE, PACE, STEP, Road, in_a_car, interpolated
 from slam.worlds.geometry import Parts, Rectangle, crate
-from slam.worlds.paths import camera_poses, clock, placed, smooth_step, sway
+from slam.worlds.paths import clock, placed, smooth_step, sway
 from slam.worlds.streets import Streets, car
 from slam.worlds.surfaces import Material
 
@@ -24,17 +24,10 @@ def street(values: Mapping[str, Any]) -> Parts:
     stamps, t = clock(values, 28.0)
     layout, moving = values["layout"], range(1, values["cars"] + 1)
     rng = np.random.default_rng([layout, 43])
-    poses = driver(driven(t) + 0.3 * sway(t, rng, 0.03, 0.15), stamps, rng)
+    poses = in_a_car(*path(driven(t) + 0.3 * sway(t, rng, 0.03, 0.15)), stamps, rng)
     cars = [part for body in moving for part in car(np.eye(4), 5000 + 20 * layout + body, body)]
     objects = np.array([_drive(t, body) for body in moving]).reshape(-1, len(t), 4, 4)
     return Parts(stamps, poses, surroundings(layout) + cars, objects)
-
-
-def driver(s: Array, stamps: Array, rng: np.random.Generator) -> Array:
-    """Camera poses (N, 4, 4) at distances s (N,) [m] along the way, shaken at times `stamps` [s]."""
-    xy, yaw = path(s)
-    positions = np.column_stack([xy, EYE + 0.01 * sway(stamps, rng, 0.8, 2)])
-    return camera_poses(positions, yaw, 0.003 * sway(stamps, rng, 0.8, 2), 0.002 * sway(stamps, rng, 0.8, 2))
 
 
 def driven(t: Array) -> Array:
@@ -97,7 +90,7 @@ def people(values: Mapping[str, Any]) -> Parts:
     stamps, t = clock(values, 14.0)
     layout = values["layout"]
     rng = np.random.default_rng([layout, 47])
-    poses = driver(5.0 * t + 0.2 * sway(t, rng, 0.03, 0.15), stamps, rng)
+    poses = in_a_car(*path(5.0 * t + 0.2 * sway(t, rng, 0.03, 0.15)), stamps, rng)
     rectangles, objects = surroundings(layout), []
     for number, (cycles, ahead, across, along, aside, pace) in enumerate(PEOPLE):
         rectangles += _person(cycles, 9000 + 50 * layout + 10 * number, PARTS * number + 1)

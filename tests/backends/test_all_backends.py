@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 import backends
 from backends.smoother.landmarks import SmootherLandmarks
@@ -15,7 +16,18 @@ from experiments.long_run import run as walk
 from slam.data import Observations
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
-from tests.backends.scenes import RIG, begun_in_the_dark, path, run, scene, step, steps_off
+from tests.backends.scenes import (
+    RIG,
+    begun_in_the_dark,
+    cloud,
+    observe,
+    path,
+    random_path,
+    run,
+    scene,
+    step,
+    steps_off,
+)
 
 SURE = EstimatorModels(
     MotionModel(0.3, 0.3), pixel_sigma=0.05, initial_position_sigma=1e-6, initial_rotation_sigma=1e-7
@@ -194,6 +206,24 @@ def test_a_map_that_begins_where_nobody_knows_how_the_camera_is_turned(name, opt
         begun.add((backend._state if name == "window" else backend.state).begun)
     assert steps_off(found, poses) < (0.08 if name == "window" else 0.1) and len(begun) <= 2, begun
     assert rejected < 60 or name == "window"
+
+
+@pytest.mark.parametrize(
+    ("name", "dark", "seed"), [("window", 40, 2), ("window", 40, 4), ("window", 110, 5), ("smoother", 110, 5)]
+)
+def test_a_camera_that_turned_anyhow_in_the_dark_does_not_claim_to_know_where_it_is(name, dark, seed):
+    """It sees next to nothing that it knows, then new landmarks, then known ones again: NEES was 570 to 80,000."""
+    motion, rng, known = MotionModel(0.5, 0.3), np.random.default_rng(seed), set()
+    poses = random_path(50 + dark, 0.1, np.array([0.0, 0.0, 0.3]), motion, rng)
+    points = cloud(poses, 600, rng)
+    models = EstimatorModels(motion, pixel_sigma=0.5, initial_velocity_sigma=1.0)
+    backend = backends.create(name, RIG, models=models)
+    for k, T in enumerate(poses):
+        seen = observe(T, points, 0.5, rng, 20)
+        step(backend, 0.1 * k, seen.select(np.full(len(seen), not 30 <= k < 30 + dark)), known)
+        found = backend.estimate(landmarks=False)
+        off = se3.log(se3.inverse(found.T_world_left) @ T)
+        assert k < 30 + dark or off @ np.linalg.solve(found.covariance, off) < chi2.ppf(0.9999, 6)
 
 
 def interrupt(call, number: int) -> bool:

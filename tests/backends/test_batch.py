@@ -15,7 +15,7 @@ from experiments.simulated_recording import true_recording
 from slam.data import StereoFeatures
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel, models_for
-from slam.run.replay import replay
+from slam.run.replay import Replay
 from slam.system import StereoSlam
 from slam.worlds import open_world
 from tests.backends.scenes import RIG, path, run, scene, with_far_points
@@ -33,7 +33,7 @@ def test_without_noise_smoother_and_batch_are_the_truth(world):
     models = replace(models_for(sequence.kind), pixel_sigma=0.01)
     recording = true_recording(sequence, models=models)
     batch = BatchBackend(recording.rig, models)
-    online = np.array([r.estimate.T_world_left for r in replay(recording, batch)])
+    online = np.array([r.estimate.T_world_left for _, r in Replay(recording, batch).run()])
     truth = se3.inverse(sequence.ground_truth.poses[0]) @ sequence.ground_truth.poses
     for name, poses in (("online", online), ("batch", batch.trajectory().poses)):
         off = np.abs(se3.log(se3.inverse(truth) @ poses))

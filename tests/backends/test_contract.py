@@ -18,12 +18,13 @@ from slam.data import Observations
 from slam.errors import MeasurementError
 from slam.guarded import guarded
 from slam.interfaces import Backend, MapBackend, RestingBackend, RevisingBackend
-from slam.testing import BACKEND_CHECKS, RIG, RUNS, check_backend, findings, protocol
+from slam.testing import GOOD, RIG, RIGHT, RUNS, check_backend, findings, protocol
 from slam.testing.__main__ import main
 from tests.backends.hostile_calls import play
 from tests.scripts import load_script
 
 ROOT = Path(__file__).parents[2]
+CHECKS = (*RUNS, *RIGHT, *GOOD)
 
 
 def by_name(check):
@@ -34,13 +35,13 @@ def by_name(check):
 NAMES = [pytest.param(n, marks=pytest.mark.slow) if n == "batch" else n for n in backends.names()]
 
 
-@pytest.mark.parametrize("check", BACKEND_CHECKS, ids=by_name)
+@pytest.mark.parametrize("check", CHECKS, ids=by_name)
 @pytest.mark.parametrize("name", NAMES)
 def test_contract(name, check):
     check(registry.resolve("backends", name))
 
 
-@pytest.mark.parametrize("check", BACKEND_CHECKS, ids=by_name)
+@pytest.mark.parametrize("check", CHECKS, ids=by_name)
 def test_the_filter_of_the_docs_passes_the_whole_contract(check):
     check(load_script("docs/examples/small_filter.py").SmallFilter)
 

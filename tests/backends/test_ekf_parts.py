@@ -10,13 +10,14 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from backends.ekf.backend import EkfConfig
-from backends.ekf.camera import predicted
+from backends.ekf.camera import displacement, from_body_axes, pose_by_error, predicted, prior
 from backends.ekf.covariance import CAMERA, HEAD, Covariance
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth, Slide
 from backends.ekf.motion import EulerCamera
-from backends.ekf.solve import gate, solve
+from backends.ekf.solve import gate, gated_correction
 from backends.ekf.state import FilterState
+from backends.iekf.filter import InvariantCamera
 from slam.geometry import se3
 from slam.geometry.se3 import body_rate_matrix, rotation
 from slam.models import EstimatorModels, MotionModel
@@ -38,15 +39,18 @@ def camera_at(phi) -> EulerCamera:
     return EulerCamera(x, se3.so3_exp(rng.standard_normal(3)), False)
 
 
-@pytest.mark.parametrize("phi", ATTITUDES)
-def test_the_pose_by_the_error(phi):
-    camera = camera_at(phi)
+RNG = np.random.default_rng(1)
+INVARIANT = InvariantCamera(se3.exp(RNG.standard_normal(6)), RNG.standard_normal(3), RNG.standard_normal(3))
 
-    def perturbation(error):
-        T = se3.inverse(camera.pose) @ camera.moved(np.pad(error, (0, 6))).pose
-        return np.concatenate([se3.so3_log(T[:3, :3]), T[:3, 3]])
 
-    np.testing.assert_allclose(camera.by_error(), jacobian(perturbation, np.zeros(6)), atol=1e-8)
+@pytest.mark.parametrize("camera", [*map(camera_at, ATTITUDES), INVARIANT])
+def test_the_pose_by_the_error(camera):
+    def perturbation(xi):
+        return se3.log(se3.inverse(camera.pose) @ camera.moved(np.pad(xi, (0, 6))).pose)
+
+    np.testing.assert_allclose(pose_by_error(camera), jacobian(perturbation, np.zeros(6)), atol=1e-8)
+    error = 0.3 * RNG.standard_normal(12)
+    np.testing.assert_allclose(camera.moved(error).minus(camera), error, atol=1e-12)
 
 
 @pytest.mark.parametrize("phi", ATTITUDES)
@@ -70,7 +74,7 @@ def test_a_new_angles_world_is_the_same_state(phi):
 
 def test_a_step_in_pieces_has_the_noise_of_a_whole_one():
     """A fast turn runs through the singularity; its position, and turns about the body, had less than a slow one's."""
-    first, _ = EulerCamera.first(MODELS, True)
+    first = EulerCamera.first(MODELS, True)
     shifts, turns = [], []
     for rate in (np.zeros(3), np.array([0.0, 4.0, 0.0])):
         camera = replace(first, x=np.concatenate([first.x[:9], rate]))
@@ -199,7 +203,8 @@ def state_of(landmarks: int, coordinates) -> tuple[FilterState, np.ndarray, np.r
     """A camera that moves among landmarks, and their true places in its coordinates."""
     rng = np.random.default_rng(5)
     h = rng.uniform((-2, -1.5, 4), (2, 1.5, 9), (landmarks, 3))
-    camera, P = EulerCamera.first(MODELS, False)
+    camera = EulerCamera.first(MODELS, False)
+    P = from_body_axes(camera, prior(MODELS))
     camera = replace(camera, x=np.concatenate([rng.standard_normal(3), ATTITUDES[1], np.zeros(6)]))
     s = replace(FilterState.first(camera, P), stamp=0.0, frame=0)
     s = replace(s, covariance=s.covariance.camera_moved(np.eye(CAMERA), 1e-4 * positive(CAMERA, rng)))
@@ -238,7 +243,7 @@ def test_the_update_is_the_joseph_form(coordinates):
     P, marks = dense(s.covariance), s.landmarks
     z = RIG.project_stereo(h + 0.01 * rng.standard_normal(h.shape))[0] + 0.3 * rng.standard_normal((12, 3))
     update = update_of(s, z, coordinates, 1)
-    solution = solve(gate(update))
+    solution = gated_correction(gate(update))
     assert solution.used.all()
     x = np.concatenate([s.camera.x, marks.c.reshape(-1)])
 
@@ -286,7 +291,7 @@ def far_off(iterations: int, spread: float = 0.05) -> tuple[FilterState, Update]
     """An update whose prior is 1.5 m and 0.15 rad off; points at 4 to 8 m are known to `spread` [m] in depth."""
     rng = np.random.default_rng(13)
     points = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (12, 3))
-    s = FilterState.first(*EulerCamera.first(MODELS, False))
+    s = FilterState.first(EulerCamera.first(MODELS, False), np.eye(12))
     truth = s.camera.moved(np.concatenate([[0.3, -0.2, 1.5, 0.05, 0.15, -0.1], np.zeros(6)])).pose
     z = RIG.project_stereo(se3.transform(se3.inverse(truth), points))[0] + 0.5 * rng.standard_normal((12, 3))
     off = np.tile([spread / 3, spread / 3, spread], (12, 1))
@@ -299,7 +304,7 @@ def far_off(iterations: int, spread: float = 0.05) -> tuple[FilterState, Update]
 
 def ungated(update: Update):
     """What all measurements give, whether they agree or not."""
-    return solve(replace(gate(update), limits=np.full(12, 1e9)))
+    return gated_correction(replace(gate(update), limits=np.full(12, 1e9)))
 
 
 def corrected(s: FilterState, update: Update) -> np.ndarray:
@@ -333,7 +338,7 @@ def far_in_depth(seed: int) -> tuple[FilterState, Update, np.ndarray]:
     """By default, pose to .3 m and .1 rad, points in inverse depth, known to 1 mrad and 20 %; and the true pose."""
     rng, n = np.random.default_rng(seed), 15
     points = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (n, 3))
-    s = FilterState.first(*EulerCamera.first(MODELS, True))
+    s = FilterState.first(EulerCamera.first(MODELS, True), np.eye(12))
     sigma = np.repeat([0.3, 0.1], 3)
     truth = s.camera.moved(np.pad(sigma * rng.standard_normal(6), (0, 6))).pose
     z = RIG.project_stereo(se3.transform(se3.inverse(truth), points))[0] + 0.5 * rng.standard_normal((n, 3))
@@ -355,7 +360,7 @@ def test_depths_that_move_do_not_bend_the_pose():
     off = []
     for seed in range(100):
         s, update, truth = far_in_depth(seed)
-        after = s.corrected(solve(replace(gate(update), limits=np.full(15, 1e9))))
+        after = s.corrected(gated_correction(replace(gate(update), limits=np.full(15, 1e9))))
         off.append(np.linalg.norm(after.pose[:3, 3] - truth[:3, 3]))
     assert (
         max(off) < 0.1 and np.sqrt(np.mean(np.square(off))) < 0.035
@@ -418,7 +423,7 @@ def test_no_linearisation_measures_a_displacement_of_the_world(coordinates, tran
         at = update.linearised(camera, change.reshape(-1))
         H = np.delete(at.HP, np.s_[CAMERA:HEAD], axis=1)
         U = np.zeros((48, 6))
-        U[:6] = np.linalg.inv((s.camera if transports else at.camera).displacement())
+        U[:6] = np.linalg.inv(displacement(s.camera if transports else at.camera))
         marks = s.landmarks if transports else s.landmarks.moved(coordinates, slice(None), change)
         U[12:] = marks.gauge.reshape(-1, 6)
         np.testing.assert_allclose(H @ U, 0, atol=1e-7)  # [px/m], [px/rad]

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 
 import backends
 from backends.ekf import EkfBackend
-from backends.ekf.innovation import Linearisation, Solution
-from backends.ekf.solve import agreement
+from backends.ekf.innovation import Correction, Linearisation
+from backends.ekf.solve import correction
 from backends.iekf import IekfBackend
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
@@ -185,7 +185,7 @@ def test_a_step_of_more_than_half_a_turn_is_a_status_with_a_reason(drive, monkey
     backend, seen = predicted(drive, 5)
     solved = Linearisation.solved
 
-    def turned(self: Linearisation, used: np.ndarray) -> Solution:
+    def turned(self: Linearisation, used: np.ndarray) -> Correction:
         found = solved(self, used)
         found.change[3] += turn
         return found
@@ -221,4 +221,4 @@ def test_of_two_agreements_of_minorities_the_larger_counts(monkeypatch):
     monkeypatch.setattr("backends.ekf.solve._agreed", found)
     camera, covariance = SimpleNamespace(pose=np.eye(4)), SimpleNamespace(P=np.eye(3))
     update = SimpleNamespace(camera=camera, covariance=covariance, z=np.zeros((12, 3)))
-    assert agreement(update, np.eye(4), lambda: None).used.sum() == 4
+    assert correction(update, np.eye(4), lambda: None).used.sum() == 4

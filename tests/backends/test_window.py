@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import backends
-from experiments.long_run import DT, MODELS, Corridor, measured
-from experiments.long_run import RIG as WALK
+from experiments.long_run import Corridor
 from experiments.long_run import run as run_long
 from slam.data import Observations
 from slam.geometry import se3
@@ -51,22 +50,6 @@ def test_a_landmark_that_is_seen_alone_is_used():
     assert all(report.status.value != "failed" and not len(report.rejected) for report in reports)
 
 
-def walk(backend, first, last, rng, known):
-    """A corridor without end: landmarks come and go."""
-    corridor = Corridor(density=4, speed=2.0)
-    for k in range(first, last):
-        ids, points = corridor.landmarks(DT * k)
-        gone = known - set(ids.tolist())
-        seen = measured(corridor.pose(DT * k), points, ids, rng)
-        old = np.isin(seen.ids, sorted(known))
-        backend.predict(DT * k)
-        backend.update(seen.select(old))
-        backend.remove(sorted(gone))
-        backend.add(seen.select(~old))
-        known -= gone
-        known |= set(seen.ids.tolist())
-
-
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_run():
     """Of the process, beyond the trajectory, once the poses that are still revised are there."""
@@ -77,17 +60,17 @@ def test_memory_does_not_grow_with_the_run():
 
 def test_a_rig_whose_errors_move_nothing_changes_no_byte():
     """Consider columns stand beside the estimate: they take no part in its arithmetic."""
-    found = []
+    found, data = [], scene(path(25, 0.1, np.array([0.0, 0.0, 1.5]), np.array([0.0, 0.3, 0.0])), points=300)
     for field in (None, lambda z: np.zeros((*z.shape, 5))):
-        backend = backends.create("window", WALK, models=MODELS)
+        backend = backends.create("window", RIG)
         if field is not None:
             backend.consider(field)
-        walk(backend, 0, 40, np.random.default_rng(0), set())
+        run(backend, data)
         found.append((backend.estimate(), backend.trajectory()))
-    (mine, path), (its, other) = found
+    (mine, one), (its, other) = found
     for name in ("T_world_left", "covariance", "positions", "covariances"):
         np.testing.assert_array_equal(getattr(mine, name), getattr(its, name))
-    np.testing.assert_array_equal(path.poses, other.poses)
+    np.testing.assert_array_equal(one.poses, other.poses)
 
 
 def test_a_revision_that_takes_a_depth_away_leaves_a_path():

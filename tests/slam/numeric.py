@@ -1,8 +1,9 @@
-"""Numerical derivatives and the rounding of matrices, for the tests."""
+"""Numerical derivatives, the rounding of matrices, and paths of steps, for the tests."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from itertools import accumulate
 
 import numpy as np
 
@@ -16,6 +17,11 @@ def jacobian(function: Callable, x: np.ndarray, step: float = 1e-6) -> np.ndarra
         d.flat[i] = step
         columns.append((np.ravel(function(x + d)) - np.ravel(function(x - d))) / (2 * step))
     return np.stack(columns, axis=-1)
+
+
+def chained(steps: Iterable[np.ndarray]) -> np.ndarray:
+    """Poses (N + 1, 4, 4) from the origin on, a step (4, 4) from each to the next."""
+    return np.array(list(accumulate(steps, np.matmul, initial=np.eye(4))))
 
 
 def assert_equal_to_rounding(found: np.ndarray, expected: np.ndarray, steps: int = 1) -> None:

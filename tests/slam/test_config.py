@@ -43,6 +43,12 @@ def test_settings_reach_their_place():
         ("map.max_landmarks", "not of the form"),
         ("models.pixel_sigma=abc", "models.pixel_sigma must be a number, got 'abc'"),
         ("association.align=often", "association.align must be true or false, got 'often'"),
+        ("objects.min_speed=-1.0", "objects.min_speed must be finite, from 0 to 1e+09, got -1.0"),
+        (
+            "objects.min_speed=1e-12",
+            "objects.min_speed must be finite",
+        ),  # its square, and the inverse of that, are none
+        ("map.max_landmarks=true", "map.max_landmarks must be a whole number, got True"),
         ("models.T_world_left=[1]", "models.T_world_left must be a (4, 4) pose"),
         ("backend.rig=3", "backend.rig: the system gives this"),
         ("map=3", "is a section"),
@@ -63,7 +69,7 @@ def test_unknown_kind_and_unknown_key_in_a_file():
     tree["map"]["colour"] = 1
     with pytest.raises(ConfigurationError, match=r"map\.colour"):
         SystemConfig.from_json(tree)
-    with pytest.raises(ConfigurationError, match=r"setting models\.motion must be an object"):
+    with pytest.raises(ConfigurationError, match=r".motion. is a section"):
         SystemConfig.from_json({"models": {"motion": None}})
 
 

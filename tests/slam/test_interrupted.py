@@ -139,10 +139,16 @@ def test_the_step_that_starts_or_finds_the_camera_in_a_map_may_be_interrupted(ca
     assert hits > 4
 
 
-@pytest.fixture(scope="module", autouse=True)
-def no_lock_is_left():
-    """After all these interrupts another thread still gets the locks of the process."""
-    yield
-    done = threading.Event()
-    threading.Thread(target=lambda: (one_blas_thread(lambda: None)(), done.set()), daemon=True).start()
-    assert done.wait(10.0)
+def test_a_call_with_one_blas_thread_that_is_interrupted_at_any_line_leaves_its_lock():
+    """Else every other thread that comes to it waits for ever."""
+    limited, counter = one_blas_thread(lambda: None), Lines()
+    limited()  # looks the libraries up
+    with counter.watched():
+        limited()
+    assert counter.count >= 8
+    for line in range(1, counter.count + 1):
+        with pytest.raises(KeyboardInterrupt), Lines(line).watched():
+            limited()
+        done = threading.Event()
+        threading.Thread(target=lambda done=done: (limited(), done.set()), daemon=True).start()
+        assert done.wait(10.0), line

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from slam.bodies.belief import EVEN, when_measured, when_missed
-from slam.bodies.bodies import hidden, new_body
+from slam.bodies.bodies import PROOF, hidden, new_body, reported
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.detector import MovingObjectDetector
 from slam.data import Estimate, StereoFeatures
 from slam.models import EstimatorModels, MotionModel, ObjectModels
 from slam.tracks.table import Tracks
+from tests.slam.bodies.test_recovery import scene
 from tests.slam.scene import RIG
 
 HERE = Estimate(0.0, np.eye(4), np.eye(6), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
@@ -50,3 +51,24 @@ def test_existence_follows_bayes_rule():
     assert when_missed(0.9, seen=7, age=8) == pytest.approx(18 / 28)
     assert when_measured(EVEN, gain=8.0) > 0.95 and when_measured(EVEN, gain=0.0) < 0.7  # at rest it shows little
     assert when_measured(0.999999, gain=1e6) < 1.0  # and never so certain that it could not be forgotten
+
+
+@pytest.mark.parametrize(
+    ("measured", "missed", "since", "existence", "told"),
+    [
+        (True, 0, 0.0, 0.3, True),
+        (False, 5, 0.9, 0.6, True),
+        (False, 6, 0.9, 0.6, False),  # for more than a twentieth of the frames in which it was measured
+        (False, 5, 1.1, 0.6, False),  # for more than a second
+        (False, 5, 0.9, 0.4, False),
+    ],
+)
+def test_a_body_out_of_view_is_reported_for_a_short_while_only(measured, missed, since, existence, told) -> None:
+    body, tracks, _, _ = scene(4, np.zeros(6), np.random.default_rng(0))
+    belief = replace(body.belief, estimate=replace(body.belief.estimate, measured=measured, stamp=10.0))
+    body = replace(
+        body, belief=belief, certain=PROOF, seen=100, missed=missed, seen_at=10.0 - since, existence=existence
+    )
+    assert [(thing.measured_at, thing.existence) for thing in reported({1: body}, tracks, 1)] == (
+        [(10.0 - since, existence)] if told else []
+    )

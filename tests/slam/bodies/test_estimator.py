@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-import backends
 from slam.bodies.belief import slid
 from slam.bodies.estimator import FRAMES, BodyEstimator
 from slam.data import Observations, RecentPoses
@@ -17,7 +16,6 @@ from slam.evaluation.metrics import chi_square_band
 from slam.geometry import se3
 from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate
-from slam.third_party import OnlinePose, recent_of
 from slam.window.problem import Motion
 from slam.window.stereo import RectifiedStereo
 from tests.slam.bodies.body_scene import SIGMA, box_scene, car_scene, follow, score
@@ -247,35 +245,6 @@ def test_too_few_points_begin_no_body():
     camera = RecentPoses(np.zeros(1), np.eye(4)[None], 1e-9 * np.eye(6))
     for wrong in (few, flat, None):
         assert BodyEstimator(scene.rig, scene.models).updated(None, 1, wrong, camera) is None
-
-
-# --- the camera's last poses ---
-
-
-def test_derived_recent_poses():
-    """Each pose has its own covariance; an increment has the noise of two frames, whatever is shared."""
-    scene, rng = box_scene(seed=2, frames=FRAMES), np.random.default_rng(0)
-    backend, path, known = backends.create("batch", scene.rig, models=scene.models), [], set()
-    for k, stamp in enumerate(scene.stamps):
-        backend.predict(float(stamp))
-        seen = scene.background(k, rng)
-        old = np.array([i in known for i in seen.ids.tolist()], bool)
-        backend.update(seen.select(old))
-        e, local = backend.estimate(landmarks=False), scene.rig.triangulate(seen.uv_left, seen.uv_right)
-        path = [*path[-2:], OnlinePose(scene.rig, SIGMA, e, local[old])]
-        backend.add(seen.select(~old))
-        known.update(seen.ids.tolist())
-    shared = np.diag([0, 0, 0, 1.0, 1, 1])  # the same displacement of the world, as an error of each pose
-    moved = [se3.adjoint(se3.inverse(one.estimate.T_world_left)) for one in path]
-    wide = [one.estimate.covariance + A @ shared @ A.T for one, A in zip(path, moved)]
-    path = [replace(one, estimate=replace(one.estimate, covariance=P)) for one, P in zip(path, wide)]
-    recent = recent_of(backend, path)
-    assert len(recent) == 3 and recent.stamps[-1] == scene.stamps[-1]
-    for k, P in enumerate(wide):
-        assert recent.covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] == pytest.approx(P, rel=0.01, abs=1e-6)
-    J = np.concatenate([-se3.adjoint(se3.inverse(recent.poses[2]) @ recent.poses[1]), np.eye(6)], axis=1)
-    step = J @ recent.covariance[6:, 6:] @ J.T
-    assert 1e-4 < np.sqrt(np.trace(step[3:, 3:])) < 0.02 and np.linalg.eigvalsh(recent.covariance).min() > 0
 
 
 # --- models ---

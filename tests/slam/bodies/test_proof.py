@@ -41,17 +41,23 @@ def way(motion: np.ndarray, jumps: float, rng: np.random.Generator, by_rig: np.n
     poses = exp(frames[:, None] * np.concatenate([motion[:3], np.zeros(3)]))
     poses[:, :3, 3] = frames[:, None] * motion[3:] + jumps * rng.standard_normal((WINDOW, 3))
     places = (poses[:, None, :3, :3] @ ENDS[:, :, None])[..., 0] + poses[:, None, :3, 3]
-    return Way(places, 0.1 * frames, by_rig, np.zeros((WINDOW, 3)))
+    return Way(places, places, 0.1 * frames, by_rig, np.zeros((WINDOW, 3)))
 
 
 def result(
     motion: np.ndarray = 0.05 * ASIDE, noise: float = 0.01, jumps: float = 0.01, still: Scene | None = None,
     by_rig: np.ndarray = NONE, far: bool = False, members: np.ndarray | None = None, both: float = 1.0,
+    along: bool = False,
 ) -> tuple[float, int]:  # fmt: skip
-    """Evidence of the first frame for ten members, and what it counts; they may show another motion."""
+    """Evidence of the first frame for ten members, and what it counts; they may show another motion.
+
+    With `along` it goes along with the camera.
+    """
     rng = np.random.default_rng(1)
-    moved = group(10, motion if members is None else members, noise, rng)
-    return with_frame(0.0, moved, scene() if still is None else still, way(motion, jumps, rng, by_rig), far, both)
+    moved, went = group(10, motion if members is None else members, noise, rng), way(motion, jumps, rng, by_rig)
+    if along:
+        went = replace(went, in_view=ENDS + jumps * rng.standard_normal((WINDOW, 1, 3)))
+    return with_frame(0.0, moved, scene() if still is None else still, went, far, both)
 
 
 @pytest.mark.parametrize("n", [4, 8, 20])
@@ -76,6 +82,8 @@ def test_still_groups_are_not_proven(n, scatter):
         (False, {"members": 0 * ASIDE}),
         (True, {"members": 0 * ASIDE, "far": True}),  # it went farther than it is wide: its way alone counts
         (False, {"jumps": 0.3, "far": True}),
+        (False, {"along": True, "far": True}),  # a bonnet, or a reflection in a windscreen
+        (True, {"along": True}),
         (False, {"both": 0.5}),  # the right image's matches are wrong for all alike, as along a repeated pattern
         (False, {"both": 0.5, "far": True}),
     ],
@@ -108,7 +116,7 @@ def test_what_goes_a_share_of_the_cameras_way_may_stand_still(share, across, cer
     frames = np.arange(WINDOW)[:, None]
     cameras = 0.05 * frames * [1.0, 0.2, 0] + 0.002 * frames**2 * [0, 0, 1.0]
     middle = share * cameras + across * frames * [0, 0, 1.0] + 1e-3 * rng.standard_normal((WINDOW, 3))
-    went = Way(middle[:, None] + ENDS, 0.1 * frames[:, 0], NONE, cameras)
+    went = Way(middle[:, None] + ENDS, ENDS, 0.1 * frames[:, 0], NONE, cameras)
     assert with_frame(0.0, group(10, 0.05 * ASIDE, 0.01, rng), scene(), went, False, 1.0)[1] == certain
 
 

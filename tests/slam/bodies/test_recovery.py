@@ -90,13 +90,21 @@ def test_few_points_move_a_body_but_do_not_turn_it_wildly(seen):
     assert np.degrees(np.arccos((np.trace(T[:3, :3]) - 1) / 2)) < 3.0
 
 
-def test_points_that_do_not_agree_or_are_too_few_say_nothing():
-    """Two points, where the body may be anywhere."""
+def test_points_that_do_not_agree_say_nothing():
     body, tracks, features, _ = scene(3, np.zeros(6), np.random.default_rng(5))
     features.uv_left[:2] += [[40.0], [-40.0]]
     assert place(body, tracks, features) is None
-    body, tracks, features, _ = scene(2, np.zeros(6), np.random.default_rng(6), deviation=2.0)
-    assert place(body, tracks, features) is None
+
+
+@pytest.mark.parametrize(
+    ("seen", "deviation", "turn", "measured"),
+    [(2, 0.5, 0.05, True), (2, 0.5, 1.0, False), (3, 0.5, 1.0, True), (3, 2.0, 0.05, False), (4, 2.0, 0.05, True)],
+)
+def test_the_less_is_known_of_a_body_the_more_points_must_agree(seen, deviation, turn, measured):
+    """It may be where it is expected, turned by a radian, or anywhere."""
+    body, tracks, features, _ = scene(seen, np.zeros(6), np.random.default_rng(6), deviation)
+    body = replace(body, covariance=np.diag([turn**2] * 3 + [deviation**2] * 3))
+    assert (place(body, tracks, features) is not None) == measured
 
 
 @pytest.mark.parametrize("wrong", [0, 1, 3])

@@ -10,6 +10,7 @@ from slam.calibration.posterior import prior_information
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry import se3
+from slam.geometry.rig import StereoRig
 from slam.system import StereoSlam
 from tests.slam.calibration.drives import CAR, Street, disparity_error, drive, parameters, pose, residual_fields
 from tests.slam.scene import GENERAL_RIG, RIG, Cloud
@@ -118,6 +119,15 @@ def test_what_no_calibration_of_this_camera_has_is_named(share, wrong, said_as, 
     rig = CAR.rectified_pair(share * CAR.left.fu, CAR.left.u0, CAR.left.v0, CAR.baseline, CAR.width, CAR.height)
     said = getattr(quarter_turn(parameters(**wrong), rig), said_as)
     assert words in said and bool(said) == bool(words)
+
+
+@pytest.mark.parametrize(("off", "frames"), [(0.0, 30), (0.5, 30), (1.0, 30), (0.0, 10)])
+def test_cropped_images_are_believed_where_they_show_that_the_calibration_is_theirs(off, frames):
+    """Its principal point is far from their middle; the true one is so much of the way nearer to that."""
+    rig = StereoRig.rectified_pair(720, 238, 166, 0.54, 807, 293)
+    x = off * (238 - 403) / 720
+    calibration = drive(parameters(left_cx=x, right_cx=x), seed=1, frames=frames, rig=rig)
+    assert ("is far from the middle of the images" in calibration.doubt) == (off > 0 or frames < 30)
 
 
 def test_on_a_straight_road_a_common_error_of_the_focal_lengths_stays_unknown():

@@ -24,7 +24,7 @@ def test_what_can_be_set_is_there_with_its_defaults(every):
     shown = {s.key: s for s in every if not s.owner}
     for kind in ("handheld", "driving"):
         tree = SystemConfig.for_kind(kind).to_json()
-        keys = [key for key in leaves(tree) if key.partition(".")[0] not in ("frontend", "backend")]
+        keys = [key for key, _ in leaves(tree) if key.partition(".")[0] not in ("frontend", "backend")]
         assert {key for key in keys if can_be_set(key)} == set(shown)
         for key in shown:
             value = reduce(getitem, key.split("."), tree)

@@ -8,8 +8,8 @@ from typer.testing import CliRunner
 
 from slam.commands.cli import app
 from slam.compare.plan import CLOSED_LOOP, Plan
-from slam.compare.sweep import Run
 from slam.compare.tables import groups, sentences
+from slam.compare.trial import Run
 from slam.errors import ConfigurationError
 from slam.geometry.trajectory import Trajectory
 

@@ -5,8 +5,8 @@ import pytest
 
 from slam.compare.plan import Plan
 from slam.compare.statistics import difference, reach
-from slam.compare.sweep import Run
 from slam.compare.tables import Group
+from slam.compare.trial import Run
 from slam.run.results import BY_KEY
 
 ATE, NEES, TRACKED, DOUBTED = (BY_KEY[key] for key in ("ate_online_m", "ratio_start", "tracked", "doubted"))

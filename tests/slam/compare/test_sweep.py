@@ -12,16 +12,15 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
-from typer.testing import CliRunner
 
-from slam.commands.cli import app
 from slam.compare.plan import CLOSED_LOOP, REPLAY, Plan
 from slam.compare.report import write_report
 from slam.compare.sweep import RUNS, SWEEP, check, sweep
 from slam.compare.tables import groups, write_tables
-from slam.compare.trial import keep_result, run_trial
+from slam.compare.trial import Run, run_trial
 from slam.errors import SlamError
 from slam.run.results import COMPARED
+from tests.scripts import command
 
 pytestmark = pytest.mark.slow  # all share one sweep
 
@@ -87,8 +86,8 @@ def test_a_defect_is_an_outcome_and_a_worker_that_is_killed_ends_it_with_what_is
     monkeypatch.setattr("slam.compare.sweep.run_trial", troubled)
     words = ["compare", "synthetic:desk?frames=4", "--frontend", "simulated", "--trials", "1"]
     words += ["--workers", "1", "--out", str(tmp_path / "out"), "--backends"]
-    stopped = CliRunner().invoke(app, [*words, "smoother,iekf,ekf"])
-    assert isinstance(stopped.exception, SlamError) and "a worker process ended" in str(stopped.exception)
+    with pytest.raises(SlamError, match="a worker process ended"):
+        command(*words, "smoother,iekf,ekf")
     assert not multiprocessing.active_children()
     outcomes = {p.parts[-3]: json.loads(p.read_text())["outcome"] for p in tmp_path.rglob("result.json")}
     assert outcomes == {"smoother": "completed", "iekf": "failed: ZeroDivisionError: a defect"}
@@ -107,7 +106,7 @@ def test_what_is_done_is_not_done_again_and_what_is_not_is(done, again):
 
 def test_a_failed_run_is_counted_never_dropped(again):
     trial = next(t for t in PLAN.trials_of(CLOSED_LOOP) if t.backend == "smoother")
-    keep_result(trial, again / RUNS / trial.folder, ValueError("no\nway"))
+    Run.failed(trial, again / RUNS / trial.folder, ValueError("no\nway")).keep()
     runs = swept(again, 1)
     group = groups(PLAN, runs)[0]
     assert (group.failures("ekf"), group.failures("smoother")) == (0, 1)

@@ -8,7 +8,7 @@ from slam.commands.cli import app
 from slam.compare import trial
 from slam.compare.plan import REPLAY, Plan, Trial
 from slam.compare.sweep import RUNS, is_done
-from slam.compare.trial import COMPLETED, keep_result
+from slam.compare.trial import COMPLETED, Run
 from slam.config import SystemConfig
 from slam.files import read_object
 from slam.sequences import open_sequence
@@ -19,7 +19,7 @@ def test_what_was_run_with_other_settings_frames_or_versions_is_not_done(tmp_pat
     """It lies there where a comparison that replaces another one was interrupted."""
     trial = Trial("synthetic:desk?frames=5", "ekf", settings=("frontend.features=100",))
     plan = Plan((trial.sequence,), ("ekf",))
-    keep_result(trial, tmp_path / RUNS / trial.folder, COMPLETED, {"ate_online_m": 0.1})
+    Run(trial, COMPLETED, {"ate_online_m": 0.1}, {}, tmp_path / RUNS / trial.folder).keep()
     assert is_done(plan, trial, tmp_path)
     monkeypatch.setattr("slam.compare.sweep.versions", lambda: {"numpy": "0.1"})
     assert not is_done(plan, trial, tmp_path)

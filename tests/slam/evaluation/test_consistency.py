@@ -14,6 +14,7 @@ from slam.evaluation.summary import evaluate
 from slam.geometry.se3 import adjoint, exp, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.run.results import verdict
+from tests.slam.numeric import chained
 
 STEP = np.array([0.0, 0.02, 0.0, 0.0, 0.0, 1.0])  # a turn of 0.02 rad and 1 m forward
 SIGMA = np.array([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.02])
@@ -23,16 +24,15 @@ NONE = TruthNoise()
 def odometry(seed: int, frames: int = 60, noise: TruthNoise = NONE, claimed: float = 1.0):
     """Estimated and true path, and the covariances that the estimate claims."""
     rng = np.random.default_rng(seed)
-    true, own, P = [np.eye(4)], [np.eye(4)], [1e-12 * np.eye(6)]
+    A, P = adjoint(inverse(exp(STEP))), [1e-12 * np.eye(6)]
+    true = chained([exp(STEP)] * (frames - 1))
+    own = chained(exp(STEP) @ exp(SIGMA * rng.normal(size=(frames - 1, 6))))
     for _ in range(frames - 1):
-        A = adjoint(inverse(exp(STEP)))
-        true.append(true[-1] @ exp(STEP))
-        own.append(own[-1] @ exp(STEP) @ exp(SIGMA * rng.normal(size=6)))
         P.append(A @ P[-1] @ A.T + claimed**2 * np.diag(SIGMA**2))
     scale = np.repeat([noise.rotation, noise.translation], 3)
     seen = np.array([T @ exp(scale * rng.normal(size=6)) for T in true])
     stamps = np.arange(frames) * 0.1
-    return Trajectory(stamps, np.array(own)), Trajectory(stamps, seen), np.array(P)
+    return Trajectory(stamps, own), Trajectory(stamps, seen), np.array(P)
 
 
 def mean_over_seeds(noise: TruthNoise = NONE, claimed: float = 1.0) -> dict[str, float]:

@@ -10,28 +10,25 @@ from evo.core import metrics as evo_metrics
 from evo.core.trajectory import PoseTrajectory3D
 
 from slam.evaluation.metrics import PathErrors, absolute_errors, associate, relative_errors, segment_errors
-from slam.geometry.se3 import exp, inverse
+from slam.geometry.se3 import exp, inverse, is_rotation
 from slam.geometry.trajectory import Trajectory, alignment
+from tests.slam.numeric import chained
 
 
-def wander(count: int, seed: int, step: float = 0.5, turn: float = 0.05) -> Trajectory:
+def wander(count: int, seed: int) -> Trajectory:
     """A path like a vehicle's: forward along z, turning."""
     rng = np.random.default_rng(seed)
-    poses = [np.eye(4)]
-    for _ in range(count - 1):
-        xi = rng.normal(0, [turn, turn, turn, 0.05, 0.05, 0.05]) + np.array([0, 0, 0, 0, 0, step])
-        poses.append(poses[-1] @ exp(xi))
-    return Trajectory(0.1 * np.arange(count), np.array(poses))
+    xi = rng.normal(0, 0.05, (count - 1, 6)) + np.array([0, 0, 0, 0, 0, 0.5])
+    return Trajectory(0.1 * np.arange(count), chained(exp(xi)))
 
 
-def disturb(truth: Trajectory, seed: int, drift: float = 0.01, gauge: bool = True) -> Trajectory:
+def disturb(truth: Trajectory, seed: int) -> Trajectory:
     """An estimate that drifts, in a world frame of its own."""
     rng = np.random.default_rng(seed)
-    poses = [truth.poses[0]]
-    for a, c in pairwise(truth.poses):
-        poses.append(poses[-1] @ inverse(a) @ c @ exp(rng.normal(0, drift, 6)))
-    T = exp(rng.normal(size=6) * (1, 1, 1, 10, 10, 10)) if gauge else np.eye(4)
-    return Trajectory(truth.stamps, T @ np.array(poses))
+    motions = inverse(truth.poses[:-1]) @ truth.poses[1:]
+    poses = chained(motions @ exp(rng.normal(0, 0.01, (len(motions), 6))))
+    T = exp(rng.normal(size=6) * (1, 1, 1, 10, 10, 10))
+    return Trajectory(truth.stamps, T @ poses)
 
 
 def to_evo(trajectory: Trajectory) -> PoseTrajectory3D:
@@ -61,11 +58,6 @@ def test_errors_are_equal_to_evo_s(count, seed):
         require_equal_to_evo(ours, truth, to_evo(estimate), evo_metrics.RPE, delta, unit, 0.1, True)
 
 
-def assert_proper(R: np.ndarray) -> None:
-    assert np.allclose(R @ R.T, np.eye(len(R)), atol=1e-12)
-    assert np.linalg.det(R) == pytest.approx(1, abs=1e-12)
-
-
 def straight(count: int) -> Trajectory:
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 2, 3] = np.arange(count)
@@ -80,7 +72,7 @@ def test_a_straight_path_is_turned_as_its_orientations_say(count: int, seed: int
     T = exp(np.random.default_rng(seed).normal(size=6) * (1, 1, 1, 10, 10, 10))
     estimate = Trajectory(truth.stamps, T @ truth.poses)
     errors = absolute_errors(estimate, truth)
-    assert_proper(alignment(estimate, truth)[:3, :3])
+    assert is_rotation(alignment(estimate, truth)[:3, :3], 1e-12)
     assert errors.translation.max() < 1e-9
     assert errors.rotation.max() < 1e-5  # [deg]
 

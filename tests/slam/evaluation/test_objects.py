@@ -78,15 +78,18 @@ def test_pixels_of_the_still_world_are_found_again(boxes):
     points = SurfacePoints(boxes)
     v, u = np.mgrid[20:220:20, 20:300:20]
     uv = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
-    ids = np.arange(len(uv))
-    points.add(0, ids, uv)
-    still = boxes.object_ids(0)[v.ravel(), u.ravel()] == 0
-    assert np.isinf(points.errors(0, ids, uv)[~still]).all()
-    assert points.errors(0, ids, uv)[still].max() < 1e-6
-    assert (points.errors(0, ids, uv + np.array([0, 4.0]))[still] > 3.9).all()
-    moved = points.errors(30, ids[still], uv[still])  # the camera moves, so the same pixels show other points
-    assert np.median(moved) > 1.0
     rows = np.arange(len(uv))
-    result = SimpleNamespace(features=SimpleNamespace(uv_left=uv), matched=ids, matched_features=rows, added=ids[:0],
-                             added_features=rows[:0])  # fmt: skip
-    assert np.isinf(points.of_matches(0, result)).sum() == (~still).sum() > 0  # matches of what moves are wrong, too
+
+    def errors(frame, matched, pixels, added=rows[:0]):
+        features = SimpleNamespace(uv_left=pixels)
+        return points.of_matches(frame, SimpleNamespace(
+            features=features, matched=matched, matched_features=matched, added=added, added_features=added
+        ))  # fmt: skip
+
+    first = rows[: len(rows) // 2]  # the others are seen first as matches, and have no error then
+    assert len(errors(0, rows[len(first) :], uv, added=first)) == 0
+    still = boxes.object_ids(0)[v.ravel(), u.ravel()] == 0
+    found = errors(0, rows, uv)
+    assert np.isinf(found[~still]).all() and found[still].max() < 1e-6 and not still.all()
+    assert (errors(0, rows, uv + np.array([0, 4.0]))[still] > 3.9).all()
+    assert np.median(errors(30, rows[still], uv)) > 1.0  # the camera moves, so the same pixels show other points

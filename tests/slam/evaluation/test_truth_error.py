@@ -8,6 +8,7 @@ import pytest
 from slam.evaluation.truth_error import doubtful, interpolated, truth_covariances
 from slam.geometry.se3 import adjoint, exp, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
+from tests.slam.numeric import chained
 
 NOISE = TruthNoise(rotation=5e-4, translation=0.02, wheels=True)
 LEVER = 1.5  # from the rear axle to the camera [m]
@@ -17,13 +18,12 @@ def drive(frames: int = 100) -> Trajectory:
     """A car that winds along a road, as its camera sees it; the camera looks half a degree to the side."""
     rng = np.random.default_rng(0)
     turn = 0.01 * np.sin(np.arange(frames) / 9)
-    poses = [np.eye(4)]
-    for k in range(frames - 1):
-        half = exp(np.array([0, 0.5 * turn[k], 0, 0, 0, 0]))
-        poses.append(poses[-1] @ half @ exp(np.array([0, 0, 0, LEVER * turn[k], 0, 1.0])) @ half)
+    halves = [exp(np.array([0, 0.5 * angle, 0, 0, 0, 0])) for angle in turn[:-1]]
+    steps = [half @ exp(np.array([0, 0, 0, LEVER * a, 0, 1.0])) @ half for half, a in zip(halves, turn)]
     side = exp(np.array([0, 0.01, 0, 0, 0, 0]))
     scatter = np.repeat([1e-4, 0.01], 3)
-    return Trajectory(0.1 * np.arange(frames), np.array([T @ side @ exp(scatter * rng.normal(size=6)) for T in poses]))
+    seen = chained(steps) @ side @ exp(scatter * rng.normal(size=(frames, 6)))
+    return Trajectory(0.1 * np.arange(frames), seen)
 
 
 def stretches(frames: int = 100) -> tuple[np.ndarray, np.ndarray]:
@@ -60,10 +60,7 @@ def test_interpolated_truth_is_noticed_where_it_is():
 def test_a_path_that_was_interpolated_as_a_whole_is_no_truth():
     """As the first frames of such a drive: nothing in them was measured, which would show what is even."""
     steps = np.array([0, 0.004, 0.001, 0, 0, 1.0]) + 5e-6 * np.random.default_rng(0).normal(size=(11, 6))
-    poses = [np.eye(4)]
-    for step in steps:
-        poses.append(poses[-1] @ exp(step))
-    true = Trajectory(0.1 * np.arange(12), np.array(poses))
+    true = Trajectory(0.1 * np.arange(12), chained(exp(steps)))
     assert interpolated(true, NOISE).all()
     assert not interpolated(drive(12), NOISE).any()
 

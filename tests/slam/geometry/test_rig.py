@@ -85,18 +85,6 @@ def test_rectified_twin_has_equal_rows_and_the_same_geometry(seed):
     np.testing.assert_allclose(rectified_rig.unrectify_right(b), right, atol=1e-8)
 
 
-def test_rectification_maps_agree_with_opencv():
-    cv2 = pytest.importorskip("cv2")
-    rig = random_rig(1)
-    rectified_rig = rig.rectified
-    K = rectified_rig.rig.left.K
-    expected = cv2.initUndistortRectifyMap(
-        LEFT.K, np.array(LEFT.distortion), rectified_rig.R_left, K, (rig.width, rig.height), cv2.CV_32FC1
-    )
-    np.testing.assert_allclose(rectified_rig.maps[0][0], expected[0], atol=1e-3)  # float32 of values up to 752
-    np.testing.assert_allclose(rectified_rig.maps[0][1], expected[1], atol=1e-3)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

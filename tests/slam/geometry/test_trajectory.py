@@ -19,7 +19,7 @@ POSITION, ANGLE = 0.51e-9, 2.1e-9
 
 
 @st.composite
-def trajectories(draw: st.DrawFn, largest: float = 1e4) -> Trajectory:
+def trajectories(draw: st.DrawFn) -> Trajectory:
     """Paths with any steps in time, turns up to half a revolution, and epochs from 0 to today's nanoseconds."""
     count = draw(st.integers(1, 8))
     start = draw(st.sampled_from([0.0, 17.25, 1_403_715_273.262143, 1.7e9]))
@@ -27,37 +27,25 @@ def trajectories(draw: st.DrawFn, largest: float = 1e4) -> Trajectory:
     rows = st.lists(st.floats(-1, 1), min_size=6, max_size=6)
     xi = np.array(draw(st.lists(rows, min_size=count, max_size=count)))
     xi[:, :3] *= np.pi / np.sqrt(3)
-    xi[:, 3:] *= largest
+    xi[:, 3:] *= 1e4
     return Trajectory(start + np.cumsum(steps), exp(xi))
 
 
-def assert_same(read: Trajectory, written: Trajectory, position: float = POSITION) -> None:
+def assert_same(read: Trajectory, written: Trajectory) -> None:
     assert np.abs(read.stamps - written.stamps).max() <= 3e-7  # a double's step at 1.7e9 s is 2.4e-7 s
-    assert np.abs(read.positions - written.positions).max() <= position
+    assert np.abs(read.positions - written.positions).max() <= POSITION
     turn = np.swapaxes(read.poses[:, :3, :3], 1, 2) @ written.poses[:, :3, :3]
     assert rotation_angle(turn).max() <= ANGLE + 1e-15 * len(turn)
     assert np.allclose(np.linalg.det(read.poses[:, :3, :3]), 1, atol=1e-8)
 
 
-quick = settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-@quick
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(trajectories())
 def test_tum_and_euroc_come_back(tmp_path: Path, trajectory: Trajectory) -> None:
     trajectory.write_tum(tmp_path / "a.txt")
     assert_same(Trajectory.read_tum(tmp_path / "a.txt"), trajectory)
     trajectory.write_euroc(tmp_path / "a.csv")
     assert_same(Trajectory.read_euroc(tmp_path / "a.csv"), trajectory)
-
-
-@quick
-@given(trajectories(largest=1e3))
-def test_kitti_comes_back(tmp_path: Path, trajectory: Trajectory) -> None:
-    trajectory.write_kitti(tmp_path / "a.txt")
-    read = Trajectory.read_kitti(tmp_path / "a.txt")
-    assert np.array_equal(read.stamps, np.arange(len(trajectory)))
-    assert np.abs(read.poses - trajectory.poses).max() <= 1e-6  # ten digits of up to 1e3 · sqrt(3) m
 
 
 def test_evo_reads_what_is_written(tmp_path: Path) -> None:
@@ -76,9 +64,9 @@ def test_evo_reads_what_is_written(tmp_path: Path) -> None:
 
 
 READERS = [
-    (Trajectory.read_tum, "1 0 0 0 0 0 0 1"),
+    (Trajectory.read_tum, "1 0 0 0 0 0 0 2"),
     (Trajectory.read_kitti, "1 0 0 0 0 1 0 0 0 0 1 0"),
-    (Trajectory.read_euroc, "1,0,0,0,1,0,0,0"),
+    (Trajectory.read_euroc, "1,0,0,0,2,0,0,0"),
 ]
 
 
@@ -89,7 +77,7 @@ READERS = [
 def test_a_malformed_file_is_refused_with_its_name(read, row: str, content: str | None, tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     path.write_text(row + "\n")
-    assert len(read(path)) == 1
+    np.testing.assert_array_equal(read(path).poses, np.eye(4)[None])  # whatever the length of a quaternion
     path.write_bytes(bytes(range(256)) if content is None else content.format(row=row, cut=row[:-2]).encode())
     for wrong in (path, tmp_path, tmp_path / "nowhere.txt"):
         with pytest.raises(TrajectoryError) as error:

@@ -17,8 +17,8 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp
 from slam.input import warnings
-from slam.input.moment import MomentWatch
-from slam.input.pair import pair_geometry, points_of, share_shown
+from slam.input.moment import MomentWatch, _lags
+from slam.input.pair import PairGeometry, pair_geometry, points_of, share_shown
 from slam.input.warnings import InputWarnings
 from slam.models import models_for
 
@@ -282,7 +282,7 @@ def test_swapped_cameras_of_an_unrectified_rig():
     views = [points_of(image) for image in seen_by_both(rig.left, rig.right, rig.R)(FRAME.left, FRAME.right)]
     rig = slam.StereoRig(rig.left, rig.right, rig.R, RIG.b)
     good, bad = pair_geometry(rig, *views, 1.5), pair_geometry(rig, *views[::-1], 1.5)
-    assert good.conclusive and not good.swapped and not good.rows_differ
+    assert good.conclusive and not good.swapped and not good.mostly(good.off_rows)
     assert bad.swapped
 
 
@@ -295,6 +295,16 @@ def test_rows_that_agree_with_the_frame_before_are_of_two_moments(early):
     pairs = [replace(a, right=b.right) if early else replace(b, right=a.right) for a, b in itertools.pairwise(moved)]
     (line,) = lines(pairs, rig=TURNED)
     assert f"to come a frame {'early' if early else 'late'}" in line
+
+
+@pytest.mark.parametrize(("off", "explained"), [(150, False), (20, True)])
+def test_another_moment_is_the_cause_only_where_most_rows_agree_by_it(monkeypatch, off, explained):
+    """Of a right camera that is rolled somewhat more rows agree with those of the frame before."""
+    own, other = PairGeometry(446, True, 100, off_rows=368, row_offset=2.0), PairGeometry(244, True, 90, off_rows=off)
+    found = itertools.chain([own, own], itertools.repeat(other))
+    monkeypatch.setattr(warnings, "pair_geometry", lambda *_: next(found))
+    (line,) = lines(every(3))
+    assert ("where right images are taken to come a frame" in line) == explained
 
 
 def test_rounding_is_no_share_of_what_rectification_does():
@@ -320,21 +330,22 @@ def test_a_baseline_in_another_unit_is_doubted(baseline, doubted):
 
 
 def test_a_calibration_that_cannot_be_that_of_the_images_leaves_no_path_to_trust():
-    assert InputWarnings(of_size(0.5), models_for("handheld"), 1.5).doubt
+    system = slam.StereoSlam(of_size(0.5))
+    assert [system.doubt] == system.warnings and "times the size of these" in system.doubt
 
 
 WIDE = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
 
 
-def doubt(late, step, box, frames, rows=lambda x, y: 0.4, since=0):
-    """What is said of frames with steps (6,) and points in a box, whose right images are late from one frame on."""
+def doubt(late, step, box, frames, rows=lambda x, y: 0.4, late_in=None):
+    """What is said of frames with steps (6,) and points in a box, of which some have late right images, or all."""
     rng, watch, T = np.random.default_rng(0), MomentWatch(WIDE), np.eye(4)
     last = exp(step(rng))
     for k in range(frames):
         points, now = rng.uniform(*box, (200, 3)), exp(step(rng))  # `now` to the next frame, `last` from the one before
         left, right = WIDE.project(points)
         there = points @ last[:3, :3].T + last[:3, 3] if late > 0 else (points - now[:3, 3]) @ now[:3, :3]
-        off = abs(late) * (WIDE.left.project(there) - left)[:, 1] if k >= since else 0.0
+        off = abs(late) * (WIDE.left.project(there) - left)[:, 1] if late_in is None or k in late_in else 0.0
         right[:, 1] += off + rows(*(left - [160.0, 120.0]).T / 300.0) + rng.normal(0, 0.1, len(points))
         ones = np.ones(len(points))
         looks = np.ones((len(points), 4), "f4")
@@ -349,12 +360,15 @@ def by_hand(rng):
 
 
 @pytest.mark.parametrize(
-    ("late", "frames", "since", "word"),
-    [(0.0, 31, 0, ""), (0.3, 31, 0, "late"), (-0.3, 31, 0, "early"), (0.3, 500, 300, "late"), (0.0, 500, 0, "")],
-)
-def test_rows_that_follow_the_motion(late, frames, since, word):
+    ("late", "frames", "late_in", "word"),
+    [
+        (0.0, 31, None, ""), (0.3, 31, None, "late"), (-0.3, 31, None, "early"), (0.3, 500, range(300, 500), "late"),
+        (-0.3, 500, range(300, 310), "early"), (0.0, 500, None, ""),
+    ],
+)  # fmt: skip
+def test_rows_that_follow_the_motion(late, frames, late_in, word):
     """A right camera that is pitched moves rows, too, but in the same way whatever the motion is."""
-    said = doubt(late, by_hand, ([-2, -1.5, 3], [2, 1.5, 9]), frames, since=since)
+    said = doubt(late, by_hand, ([-2, -1.5, 3], [2, 1.5, 9]), frames, late_in=late_in)
     assert bool(said) == bool(word) and f"right images were {word} by" in (said or "right images were  by")
 
 
@@ -372,3 +386,12 @@ def test_a_camera_that_hardly_moves_shows_no_lag():
     """Its rows, here off by the lens, and the flow by errors of its poses are alike in all frames."""
     step = np.array([1e-5, 0, 0, 0, 0, 0])
     assert doubt(0.0, lambda rng: step, ([-2, -1.5, 3], [2, 1.5, 9]), 31, lambda x, y: y * y) == ""
+
+
+@pytest.mark.parametrize(("flow", "lag"), [(1.0, 0.5), (0.03, 0.0)])
+def test_a_lag_counts_only_where_the_motion_moves_rows(flow, lag):
+    """A board that moves before a standing camera was taken for right images of another moment."""
+    columns = np.random.default_rng(0).normal(size=(8, 2, 50, 7)) * [0.1 * flow, flow, 1, 1, 1, 1, 1]
+    columns[..., 0] -= 0.5 * columns[..., 1]
+    sums = np.swapaxes(columns, 2, 3) @ columns
+    np.testing.assert_allclose(_lags(sums, sums.sum(axis=0), 0.2), lag, atol=0.02)

@@ -12,6 +12,7 @@ from slam.papers.procedure1 import (
     detect,
     motion_covariance,
     motion_of_triples,
+    placed,
     why_degenerate,
 )
 from tests.slam.scene import RIG
@@ -51,11 +52,12 @@ def test_detects_the_motion_and_prints_rpy():
     moved = transform(MOTION, POINTS)
     features = features_of(moved)
     matches = (np.arange(4), np.arange(4))
-    found = detect(features, matches, moved, database)
-    assert found.reason == ""
-    np.testing.assert_array_equal(found.triple, [0, 1, 2])  # the largest determinants
-    np.testing.assert_allclose(np.degrees(angles(found.R)), [-35.0, -15.1, 5.8], atol=1e-6)
-    np.testing.assert_allclose(found.translation, moved[0] - POINTS[0], atol=1e-9)
+    triple, reason = detect(features, matches, moved, database)
+    assert reason == ""
+    np.testing.assert_array_equal(triple, [0, 1, 2])  # the largest determinants
+    T = placed(moved[triple], database.points[triple], database.origin)
+    np.testing.assert_allclose(np.degrees(angles(T[:3, :3])), [-35.0, -15.1, 5.8], atol=1e-6)
+    np.testing.assert_allclose(T[:3, 3] - database.origin, moved[0] - POINTS[0], atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -75,10 +77,9 @@ def test_degenerate_triples_are_refused(points, reason):
 def test_next_triple_is_taken_where_the_first_is_degenerate():
     points = np.array([[0, 0, 1.0], [0.1, 0, 1], [0.2, 0.001, 1], [0.1, 0.15, 1.1]])
     database = ObjectDatabase.of(features_of(points), np.arange(4), RIG, np.eye(4))
-    found = detect(features_of(points), (np.arange(4), np.arange(4)), points, database)
-    assert found.reason == "" and 3 in found.triple
-    two = detect(features_of(points), (np.arange(2), np.arange(2)), points[:2], database)
-    assert "3 are needed" in two.reason
+    triple, reason = detect(features_of(points), (np.arange(4), np.arange(4)), points, database)
+    assert reason == "" and 3 in triple
+    assert "3 are needed" in detect(features_of(points), (np.arange(2), np.arange(2)), points[:2], database)[1]
 
 
 def test_covariance_agrees_with_monte_carlo():

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import resource
+import signal
 import stat
+from contextlib import contextmanager
 
 import pytest
 
@@ -15,9 +17,22 @@ from slam.files import whole_file
 from slam.run import runner
 from slam.run.options import RunOptions
 from slam.run.recording import load_recording
-from tests.failing_runs import Features, Scripted, disk_of
+from tests.failing_runs import Features, Scripted
 
 LAST = ("trajectory_final.txt", "landmarks.csv", "summary.json")
+
+
+@contextmanager
+def disk_of(size):
+    """Files can grow to `size` bytes: as on a full disk, writes fail, or are cut short."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
 
 
 def run(tmp_path, sequence=None, watches=(), **more):

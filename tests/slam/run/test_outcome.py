@@ -18,6 +18,7 @@ from slam.outputs import Output
 from slam.run.options import RunOptions
 from slam.run.outcome import motion_doubt, outcome, scale_doubt
 from slam.run.summary import RunRecord
+from tests.slam.numeric import chained
 
 OPTIONS = RunOptions("ekf", "surf", SystemConfig())
 RIG = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
@@ -57,9 +58,7 @@ def moving(times_too_short: float, frames: int = 40) -> RunRecord:
     rng = np.random.default_rng(0)
     interval = 0.05
     velocities = np.cumsum(rng.normal(size=(frames, 6)) * np.sqrt(interval), axis=0)
-    poses = [np.eye(4)]
-    for velocity in velocities[1:]:
-        poses.append(poses[-1] @ exp(velocity * interval))
+    poses = list(chained(exp(velocities[1:] * interval)))
     stamps = (np.arange(frames) * interval / times_too_short).tolist()
     return RunRecord(stamps=stamps, poses=poses, measured=[True] * frames)
 
@@ -107,14 +106,18 @@ def test_a_vehicle_that_goes_sideways_is_doubted():
     assert motion_doubt(along((0.3, 0, 0.05)), MotionModel()) == ""
 
 
-@pytest.mark.parametrize("closed", [[], [15]])
-def test_a_camera_that_jumps_is_doubted_but_not_where_a_loop_moves_the_path(closed):
+@pytest.mark.parametrize(
+    ("closed", "lost", "words"), [([], [], "changes by 20 m/s"), ([], [15, 16], "changes by 6.7 m/s"), ([15], [], "")]
+)
+def test_a_camera_that_jumps_is_doubted_but_not_where_a_loop_moves_the_path(closed, lost, words):
     run = along((0, 0, 0.4), closed=closed)
+    for k in lost:  # until landmarks are believed again
+        run.measured[k] = False
     assert motion_doubt(run, MotionModel()) == ""
     for k in range(15, 30):  # as by images that are missing
         run.poses[k] = exp(np.array([0, 0, 0, 0, 0, 2.0])) @ run.poses[k]
     said = motion_doubt(run, MotionModel())
-    assert said.startswith("the velocity changes by 20 m/s from one frame to the next") if not closed else said == ""
+    assert words in said and bool(words) == bool(said)
 
 
 @pytest.mark.parametrize(("doubt", "status"), [("", 0), ("rows do not agree", 1)])

@@ -13,10 +13,10 @@ from slam.config import SystemConfig
 from slam.data import FrameStatus
 from slam.errors import MeasurementError, SequenceError
 from slam.run.recording import RecordedFrame, Recording, load_recording, save_recording
-from slam.run.replay import replay
+from slam.run.replay import Replay
 from slam.system import StereoSlam
 
-FRAMES = 12
+FRAMES, NONE = 12, np.zeros(0, np.int64)
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +33,10 @@ def recorded_of(results, system):
     return Recording("desk", system.rig, system.config.models, tuple(map(RecordedFrame.of, results)))
 
 
+def replay(recording, backend):
+    return [result for _, result in Replay(recording, backend).run()]
+
+
 def online(results):
     return np.array([r.estimate.T_world_left for r in results])
 
@@ -44,7 +48,7 @@ def test_a_run_replayed_into_the_same_back_end_is_the_same_run(rig):
     system = StereoSlam(desk.rig, None, "ekf", config=config)
     results = [system.process_features(desk.observations(k)) for k in range(FRAMES)]
     recorded = recorded_of(results, system)
-    again = list(replay(recorded, StereoSlam(desk.rig, None, "ekf", config=config).backend))
+    again = replay(recorded, StereoSlam(desk.rig, None, "ekf", config=config).backend)
     # Not the last bit: the pose on which all agree was found there among more candidates.
     np.testing.assert_allclose(online(again), online(results), atol=1e-9)
     for ours, theirs in zip(again, results):
@@ -80,7 +84,17 @@ def test_what_was_corrected_in_a_run_is_corrected_in_its_replay(desk, recording,
     for k, mended in given.items():
         np.testing.assert_array_equal(mended, revisions[k].rows(z))
     assert given[8][0, 2] == pytest.approx(180.3, abs=0.02) and given[11][0, 2] == pytest.approx(179.9, abs=0.02)
-    assert len(list(replay(again, StereoSlam(desk.rig, None, "ekf").backend))) == FRAMES
+    assert len(replay(again, StereoSlam(desk.rig, None, "ekf").backend)) == FRAMES
+
+
+def test_a_landmark_may_leave_in_the_frame_in_which_it_is_added(desk, recording):
+    first, *others = recording.frames
+    (gone,) = first.added.ids[:1]
+    rest = (replace(f, observed=f.observed.select(f.observed.ids != gone), removed=NONE) for f in others)
+    frames = (replace(first, removed=np.array([gone])), *rest)
+    system = Replay(replace(recording, frames=frames), StereoSlam(desk.rig, None, "ekf").backend)
+    last = [result for _, result in system.run()][-1]
+    assert gone not in system.estimate().ids and len(system.estimate().ids) == last.map_size
 
 
 def test_a_file_holds_it_all(recording, tmp_path):

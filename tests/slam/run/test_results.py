@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from slam.compare.plan import Plan, Trial
-from slam.compare.sweep import Run
 from slam.compare.tables import groups, honesty
+from slam.compare.trial import Run
 from slam.run.results import errors_of_truth, facts, figures, rows, verdict, verdict_of_run
 
 TEN, ONE, START, HUNDRED = "ratio_10m", "ratio_1m", "ratio_start", "ratio_100m"
@@ -112,5 +112,7 @@ def test_errors_of_the_truth_are_said_in_sentence_table_and_head_and_a_wrong_one
         assert words in said and ("true path" in said) == bool(words)
     assert ("truth_sigma=" in verdict_of_run(given)) == words.startswith("none")
     assert "truth_sigma=" not in verdict_of_run(given | {"format": "recording"})  # which has no options
+    for length, said in ((0.0084, "8.4 mm"), (0.84, "0.84 m")):
+        assert f"path length {said}" in facts(given | {"path_length_m": length})
     wrong = given | {"consistency": {}, "truth_doubt": "it is in mm"}
     assert verdict_of_run(wrong).startswith("covariances are not judged: the true path")

@@ -21,13 +21,12 @@ from slam.errors import SequenceError, SlamError
 from slam.geometry.trajectory import Trajectory
 from slam.run import schema
 from slam.run.options import RunOptions
-from slam.run.outputs import FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS
 from slam.run.recording import load_recording
 from slam.run.run_data import RunData
 from slam.run.runner import run
 from slam.run.summary import RunRecord
 from slam.sequences import open_sequence
-from tests.failing_runs import FRAMES, Features, Scripted, require_whole
+from tests.failing_runs import FRAMES, Features, Scripted
 
 WORLD = "synthetic:aisle?frames=12"
 WITH_TRUTH = set(schema.FILES) - {"summary.png"}  # that one is the command's
@@ -68,7 +67,6 @@ def test_a_run_leaves_its_files(tmp_path):
     online = Trajectory.read_tum(tmp_path / "trajectory.txt")
     assert len(online) == len(Trajectory.read_tum(tmp_path / "trajectory_final.txt")) == 12
     rows, landmarks = rows_of(tmp_path / "frames.csv"), rows_of(tmp_path / "landmarks.csv")
-    assert (tuple(rows[0]), tuple(landmarks[0])) == (FRAME_COLUMNS, LANDMARK_COLUMNS)
     assert [r["status"] for r in rows] == ["started"] + ["tracked"] * 11
     assert [int(r["frame"]) for r in rows] == list(range(12))
     P = {name: float(rows[-1][name]) for name in ("c00", "c11", "c22", "c33", "c44", "c55")}
@@ -77,7 +75,6 @@ def test_a_run_leaves_its_files(tmp_path):
     assert sum(sd[axis] ** 2 for axis in "xyz") == pytest.approx(P["c33"] + P["c44"] + P["c55"], rel=1e-6)
     assert len(landmarks) == summary["landmarks"] == int(rows[-1]["map_size"])
     assert all(float(r["cxx"]) > 0 for r in landmarks)
-    assert (tmp_path / "objects.csv").read_text().strip() == ",".join(OBJECT_COLUMNS)
     assert json.loads((tmp_path / "summary.json").read_text()) == json.loads(json.dumps(summary))
     assert summary["ended"] == "completed"
     assert summary["accuracy"]["online"]["ATE RMSE [m]"] < 0.01
@@ -164,9 +161,9 @@ def test_a_stopped_run_keeps_its_frames(tmp_path, kill, ignored):
     _, errors = process.communicate(timeout=300)
     assert process.returncode == (0 if ignored else -9 if kill is signal.SIGKILL else 128 + kill), errors
     assert len(Trajectory.read_tum(path)) >= 5
-    for left in out.glob("*.part"):  # of a kill while a last file was written: beside its place, not in it
-        left.unlink()
-    require_whole(tmp_path, out)
+    if (final := out / "trajectory_final.txt").exists():  # what a kill leaves in part is beside its place
+        assert len(Trajectory.read_tum(final)) >= 5
+    assert None not in rows_of(out / "frames.csv")[-1].values() and json.loads((out / "config.json").read_text())
     if kill is not signal.SIGKILL and not ignored:
         assert f"stopped by {kill.name}; frames done so far are kept: `slam plot" in errors
         assert json.loads((out / "summary.json").read_text())["ended"] == "ended by the user"

@@ -13,6 +13,7 @@ from slam.geometry.se3 import exp
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.run.results import figures
 from slam.run.summary import RunRecord, results_of
+from tests.slam.numeric import chained
 
 N, SIGMA = 120, 0.01
 NONE = np.zeros(0, np.int64)
@@ -84,13 +85,11 @@ def test_a_path_that_lacks_frames_is_said(caplog):
 def test_truth_that_begins_after_the_first_image_is_judged_from_there_and_a_wrong_one_not_at_all(caplog):
     record = RunRecord(milliseconds=[{}] * N, measured=[True] * N, common=[CommonError()] * N)
     steps = np.array([exp(0.1 * SIGMA * step) for step in np.random.default_rng(0).standard_normal((N, 6))])
-    poses = [np.eye(4)]
-    for k in range(1, N):
-        poses.append(poses[-1] @ exp(np.array([0, 0, 0, 0, 0, 0.2])) @ steps[k])
-    record.stamps, record.poses = TRUTH.stamps.tolist(), poses
+    poses = chained(exp(np.array([0, 0, 0, 0, 0, 0.2])) @ steps[1:])
+    record.stamps, record.poses = TRUTH.stamps.tolist(), list(poses)
     record.covariances = [(0.1 * SIGMA) ** 2 * k * np.eye(6) for k in range(N)]
     late = SimpleNamespace(format="folder", ground_truth=TRUTH.select(np.arange(20, N)), truth_noise=TruthNoise())
-    final = Trajectory(TRUTH.stamps, np.array(poses))
+    final = Trajectory(TRUTH.stamps, poses)
     found = results_of(late, SimpleNamespace(), record, final, None)
     assert "mean NEES" in found["consistency"] and found["consistency"]["poses before the truth"] == 20
     late.ground_truth.poses[:, :3, 3] *= 1000.0

@@ -58,7 +58,7 @@ def board_world() -> Callable[..., WorldSequence]:
         values = {**base.values, "density": 1e4}
         parts = Parts(w.stamps, w.T_world_left, walls)
         scene = Scene("boards", lambda _: parts, (0.3, 3.5), 640.0)
-        return WorldSequence("board", assemble("board", scene, values, parts), values)
+        return WorldSequence("board", assemble("board", scene, values), values)
 
     return make
 
