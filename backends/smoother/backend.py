@@ -174,7 +174,7 @@ class SmootherBackend:
 
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:
-        """See `slam.interfaces.RevisingBackend.revise`: the newest pose stays where it is.
+        """See `slam.interfaces.RevisingBackend.revise`: the newest pose stays unless landmarks are known in the world.
 
         The graph is built anew from corrected measurements, and landmarks move to where they put them. Poses that have
         left the lag move as a whole: the path does not part there.

@@ -113,7 +113,7 @@ class Graph:
             except SolverError as error:
                 why, self._careful = str(error), s.number + (self._lag or _CAREFUL)
         if why:
-            s = replace(s, landmarks=s.landmarks.without_variables(s.number))
+            s = replace(s, landmarks=s.landmarks.without_variables(int(s.ages[-1])))
         return self.rebuilt(s), why
 
     def rebuilt(self, s: SmootherState, steps: int = 0) -> Solved:

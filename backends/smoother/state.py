@@ -122,6 +122,11 @@ class SmootherState:
         """Row of a pose."""
         return number - self.first
 
+    def age(self, numbers: IndexArray | int) -> IndexArray:
+        """`ages` of poses, −1 of one that is not kept."""
+        rows = np.asarray(numbers) - self.first
+        return np.where(rows < 0, -1, self.ages[np.maximum(rows, 0)])
+
     def oldest(self, lag: int | None, newest: int) -> int:
         """Number of the oldest pose in the graph, once it has the newest one of such a number."""
         least = max(self.begun, self.first)

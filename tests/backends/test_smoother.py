@@ -298,6 +298,18 @@ def test_landmarks_that_are_variables_outlast_more_than_a_lag_of_frames_that_mea
     assert errors(after.T_world_left, data.poses[-1])[0] < 3 * deviations[1]
 
 
+@pytest.mark.parametrize(("every", "frames"), [(9, 118), (20, 121)])
+def test_frames_that_measure_are_held_together_however_many_lie_between(every, frames):
+    """Each landmark's factor was taken for one that had not been measured for long: sigma was 1.7 to 5.7 m."""
+    poses, known = path(frames, DT, np.array([0.0, 0.0, 0.4]), np.array([0.0, 0.03, 0.0])), set()
+    backend = SmootherBackend(RIG, MODELS)
+    for k, (stamp, _, seen) in enumerate(scene(poses, points=300, limit=40)):
+        step(backend, stamp, Observations.empty() if k % every else seen, known)
+    last = backend.estimate(landmarks=False)
+    deviation = np.sqrt(np.trace(last.covariance[3:, 3:]))
+    assert errors(last.T_world_left, poses[-1])[0] < 3 * deviation < 0.1
+
+
 def test_the_map_is_where_it_was_after_a_hundred_frames_in_the_dark():
     """The problem began anew with the pose as predicted: it and the map were 2.2 m off from then on."""
     models = EstimatorModels(
@@ -374,7 +386,7 @@ def test_a_revision_that_changes_nothing_leaves_the_covariances():
     assert (deviations[1] > 0.99 * deviations[0]).all() and (deviations[1] < 1.3 * deviations[0]).all()
     seen = np.isin(before.ids, data.observations[-1].ids)
     sizes = [np.sqrt(np.trace(e.covariances, axis1=1, axis2=2))[seen] for e in (before, after)]
-    np.testing.assert_allclose(sizes[1], sizes[0], rtol=0.12)
+    np.testing.assert_allclose(sizes[1], sizes[0], rtol=0.2)  # they move with the pose that the graph begins with
     assert abs(np.median(sizes[1] / sizes[0]) - 1) < 0.01
 
 
