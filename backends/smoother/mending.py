@@ -40,6 +40,7 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
         M = s.poses[-1] @ inverse(solved.poses[-1])
         graph.displaced(M)
         solved, s = solved.displaced(M), replace(s, start=M @ s.start)
+        solved = replace(solved, poses=np.concatenate([solved.poses[:-1], s.poses[-1:]]))  # to the last digit
     D = solved.poses[0] @ inverse(s.poses[s.of(oldest)])
     unseen = ~marks.world & ~(marks.pose >= oldest).any(axis=1)
     position = np.where(unseen[:, None], transform(D, marks.position), marks.position)
