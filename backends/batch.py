@@ -64,14 +64,15 @@ class BatchBackend:
         self.models = models
         along = self._smoother = SmootherBackend(rig, models, lag=None)
         self.predict, self.update, self.add, self.remove = along.predict, along.update, along.add, along.remove
-        self.positions, self.insert, self.place = along.positions, along.insert, along.place
+        self.predict_at_rest, self.positions = along.predict_at_rest, along.positions
+        self.insert, self.place = along.insert, along.place
         self.consider, self.sensitivities, self.revise = along.consider, along.sensitivities, along.revise
         self._solution: _BatchSolution | None = None
 
     @one_blas_thread
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
-        if not landmarks:
+        if not (landmarks and self._smoother.state.started):
             return self._smoother.estimate(landmarks=False)
         solution = self._solved()
         try:

@@ -58,7 +58,7 @@ def _wanted(value: Any, hint: Any, limits: tuple[float, float] | None) -> str:
     kind, kinds = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         faults = [_wanted(value, one, limits) for one in kinds]
-        return "" if "" in faults else " or ".join(faults)
+        return "" if "" in faults else ", or ".join(faults)
     if kind is tuple:
         return _wanted_each(value, kinds, limits)
     of_class = (kind, f"of type {getattr(kind, '__name__', kind)}") if is_dataclass(kind) else (object, "")

@@ -44,7 +44,10 @@ class StereoFrame:
     left_mask: BoolArray | None = None
     right_mask: BoolArray | None = None
 
-    __repr__ = of_shapes
+    def __repr__(self) -> str:
+        height, width = self.left.shape[:2]
+        right = "" if self.right is not None else ", no right image"
+        return f"StereoFrame({self.index}, {self.stamp:.3f} s, {width}x{height} {self.left.dtype}{right})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +227,10 @@ class UpdateReport:
     nis: float
     dof: int
 
-    __repr__ = of_shapes
+    def __repr__(self) -> str:
+        why = f" ({self.reason})" if self.reason else ""
+        taken = f"{len(self.used)} used, {len(self.rejected)} rejected"
+        return f"UpdateReport({self.status.value}{why}, {taken}, NIS {self.nis:.1f} of {self.dof})"
 
     @classmethod
     def nothing(cls, status: UpdateStatus, reason: str, rejected: IdArray | None = None) -> UpdateReport:

@@ -24,6 +24,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
 from slam.window.consensus import landmarks_pose
+from slam.window.recovery import LASTING
 from slam.window.stereo import TOO_LATE, Field, RectifiedMeasurement
 
 #: Standard deviations of a known point between it and its anchor: its coordinates are linear there, it stays Gaussian.
@@ -180,20 +181,24 @@ class LandmarkFilter:
     revises_path = False
 
     def revise(self, correct: Callable[[Array], Array]) -> None:
-        """See `slam.interfaces.RevisingBackend.revise`: landmarks in view move to where they are seen at from now on.
+        """See `slam.interfaces.RevisingBackend.revise`: landmarks move to where they are seen at from now on.
 
-        The measurements are gone; what they made of the path stays. But landmarks that were placed by pixels as they
-        were corrected before, and seen at pixels as they are now, would look as if the camera had moved. Those of a
-        prior map that were not measured yet were placed by no pixels: they stay.
+        By the camera of their first sight, if not by the present one. The measurements are gone; what they made of the
+        path stays. But landmarks that were placed by pixels as they were corrected before, and seen at pixels as they
+        are now, would look as if the camera had moved. Those of a prior map that were not measured yet were placed by
+        no pixels: they stay.
         """
         s, stereo = replace(self.state, measured=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
-            z, _ = stereo.project(se3.transform(se3.inverse(s.pose), s.landmarks.points))
-            rows = np.flatnonzero(self.rig.left.in_image(z[:, :2])[: s.covariance.correlated])
-            z = stereo.corrected(self.name, z[rows], correct)
-            points = se3.transform(s.pose, stereo.triangulate(z))
+            marks = s.landmarks.select(slice(s.covariance.correlated))
+            z, _ = stereo.project(se3.transform(se3.inverse(s.pose), marks.points))
+            T = np.where(self.rig.left.in_image(z[:, :2])[:, None, None], s.pose[:3], marks.anchors)
+            z, _ = stereo.project(((marks.points - T[:, :, 3])[:, None] @ T[:, :, :3])[:, 0])
+            rows = np.flatnonzero(np.isfinite(z[:, 0]))
+            local = stereo.triangulate(stereo.corrected(self.name, z[rows], correct))
+            points = (T[rows, :, :3] @ local[:, :, None])[:, :, 0] + T[rows, :, 3]
             good = np.isfinite(points).all(axis=1)
-            s = s.displaced(self._coordinates, s.landmarks.ids[rows[good]], points[good])
+            s = s.displaced(self._coordinates, marks.ids[rows[good]], points[good])
         self.state = s
 
     # --- the filter's parts ---
@@ -248,11 +253,12 @@ class LandmarkFilter:
             return landmarks_pose(measure, update.landmarks.points, z, T, s.frame + 1)
 
         try:
-            found = correction(update, guess, search)
+            found = correction(update, guess, search, s.contradicted + 1 < LASTING)
             if found is None:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids.copy())
-            after = slid.corrected(found)
+            contradicted = s.contradicted + 1 if 2 * found.used.sum() < len(z) else 0
+            after = replace(slid.corrected(found), contradicted=contradicted)
         except LinAlgError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self.name}: {error}")
         used = found.used

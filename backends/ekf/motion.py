@@ -108,15 +108,14 @@ class EulerCamera:
         the attitude stays a turn about the world's axes. So a turn of the world, which nothing measures, is the same
         error before and after: with A as printed the covariance would shrink along it in every step.
         """
-        A, x = np.eye(CAMERA), self.x.copy()
+        A = np.eye(CAMERA)
         A[:POSE, POSE:] = dt * np.eye(POSE)
-        x[:POSE] += dt * self.x[POSE:]
-        after = replace(self, x=x)
-        if self.transports:
-            A[3:6, 3:6] = np.linalg.solve(after.turning, self.turning)
-            A[9:, 9:] = np.linalg.solve(body_rate_matrix(x[3:6]), body_rate_matrix(self.x[3:6]))
-            x[9:] = A[9:, 9:] @ x[9:]
-        return after, A
+        after = replace(self, x=A @ self.x)
+        if not self.transports:
+            return after, A
+        A[3:6, 3:6] = np.linalg.solve(after.turning, self.turning)
+        A[9:, 9:] = np.linalg.solve(body_rate_matrix(after.x[3:6]), body_rate_matrix(self.x[3:6]))
+        return replace(after, x=np.append(after.x[:9], A[9:, 9:] @ self.x[9:])), A
 
     def stopped(self) -> EulerCamera:
         """See `Camera`."""

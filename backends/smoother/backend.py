@@ -56,11 +56,6 @@ class SmootherBackend:
         self._graph = Graph(self.factor_maker, self.config.lag)
         self.state = SmootherState.empty(np.zeros((6, 0)))
 
-    @property
-    def rebuilds(self) -> int:
-        """How often the graph was built anew after a failure of gtsam."""
-        return self._graph.rebuilds
-
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
     @one_blas_thread
@@ -130,8 +125,9 @@ class SmootherBackend:
     @one_blas_thread
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: poses that have left the lag move as one, by `revise` alone."""
-        s = self.state
-        return Trajectory(np.append(s.left_stamps, s.stamps), np.concatenate([s.left_poses, s.poses]))
+        stamps = np.append(self.state.left_stamps, self.state.stamps)
+        order = np.argsort(stamps)
+        return Trajectory(stamps[order], np.concatenate([self.state.left_poses, self.state.poses])[order])
 
     def landmark_covariances(self, rows: IndexArray) -> Array:
         """Covariances (M, 3, 3) in the world of rows of `state.landmarks`."""
@@ -178,7 +174,7 @@ class SmootherBackend:
 
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:
-        """See `slam.interfaces.RevisingBackend.revise`: the newest pose stays where it is.
+        """See `slam.interfaces.RevisingBackend.revise`: the newest pose stays unless landmarks are known in the world.
 
         The graph is built anew from corrected measurements, and landmarks move to where they put them. Poses that have
         left the lag move as a whole: the path does not part there.

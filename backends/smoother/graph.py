@@ -73,12 +73,10 @@ class Graph:
     known in the world the first pose has its own covariance instead.
 
     Attributes:
-        rebuilds: how often it was built anew after a failure.
         number: of the newest pose in it; −1 for none.
     """
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:
-        self.rebuilds = 0
         self._careful = 0  # number of the first pose whose factors may be made quickly again, after a failure
         self._make, self._lag = make, lag
         self.restart()
@@ -113,10 +111,9 @@ class Graph:
                 problem = GraphProblem(to_graph=inverse(self._to_state))
                 return self._update(s, range(number + 1, s.number + 1), problem), ""
             except SolverError as error:
-                why, self.rebuilds = str(error), self.rebuilds + 1
-                self._careful = s.number + (self._lag or _CAREFUL)
+                why, self._careful = str(error), s.number + (self._lag or _CAREFUL)
         if why:
-            s = replace(s, landmarks=s.landmarks.without_variables(s.number))
+            s = replace(s, landmarks=s.landmarks.without_variables(int(s.ages[-1])))
         return self.rebuilt(s), why
 
     def rebuilt(self, s: SmootherState, steps: int = 0) -> Solved:

@@ -13,7 +13,7 @@ from slam.geometry.arrays import LandmarkRows
 from slam.geometry.se3 import Array, points_by_pose
 from slam.window.stereo import RectifiedStereo
 
-RECENT = 12  # so many of its last measurements give a landmark's position and covariance
+RECENT = 40  # cost: so many of its last measurements give a landmark's position and covariance; more tell little more
 VARIABLE = -(10**9)  #: in place of `SmootherLandmarks.since`: no smart factor, but a variable of the graph
 
 
@@ -30,7 +30,7 @@ class SmootherLandmarks(LandmarkRows):
     world: BoolArray  # whether that does not depend on any pose (S,)
     z: Array  # its last measurements (S, RECENT, 3)
     pose: IndexArray  # and the numbers of their poses (S, RECENT), −1 for none
-    # number of the pose from which the span of its smart factor counts (S,); or VARIABLE, but not of known ones
+    # age (`SmootherState.ages`) from which the span of its smart factor counts (S,); or VARIABLE, but not of known ones
     since: IndexArray
     linearised: Array  # where the graph has it linearised, if it is a variable (S, 3) [m]
     by_rig: Array  # derivatives of the positions by errors of the rig (S, 3, m)
@@ -57,27 +57,30 @@ class SmootherLandmarks(LandmarkRows):
         """Covariances (S, 3, 3) of the positions where the newest pose is known, in world axes."""
         return self.own + self.away
 
-    def measured(self, rows: IndexArray, z: Array, pose: int, track: int, oldest: int, solved: int) -> Self:
-        """With one more measurement (M, 3) of some landmarks, from the pose of a number.
+    def spans(self, rows: IndexArray, last: IndexArray, age: int, track: int, solved: int) -> IndexArray:
+        """`since` (M,) of landmarks that a pose of an `age` measures; the last that did were of ages (M,), −1 for none.
 
         A smart factor spans at most `track` poses. Then, or if a landmark was not measured for half as many, it goes on
         in a new one. If landmarks that were found together all began anew at once, the motion model alone would tie
         that pose to the one before. So the first factor spans fewer, down to half of them, differently for each
-        landmark. Where frames that measured nothing come between this pose and the last one that was `solved` for,
-        many factors end at once all the same: of these every other one takes this measurement as well, unless its first
-        pose has left the graph.
+        landmark. Where poses that measured no known landmark came since the one of age `solved`, every other factor
+        takes this measurement as well, unless its first pose has left the graph.
+        """
+        since, half = self.since[rows], max(track // 2, 1)
+        longer = (last >= 0) & (0 <= solved < age - 1) & (since > solved - track) & (self.serial[rows] // 2 % 2 == 0)
+        anew = np.where(since <= age - track, age, since)
+        anew = np.where((last < 0) | (last < age - half), age - self.serial[rows] % half, anew)
+        return np.where(longer | (since == VARIABLE), since, anew)
+
+    def measured(self, rows: IndexArray, z: Array, pose: int, since: IndexArray, oldest: int) -> Self:
+        """With one more measurement (M, 3) of some landmarks, from the pose of a number, in factors `since` (M,).
 
         What was measured last before pose `oldest` is left out from now on: the camera has drifted. It counts as what
         was known beforehand.
         """
-        last, since, half = self.pose[rows].max(axis=1), self.since[rows], max(track // 2, 1)
-        longer = (last >= 0) & (0 <= solved < pose - 1) & (since > solved - track) & (self.serial[rows] // 2 % 2 == 0)
-        anew = np.where(since <= pose - track, pose, since)
-        anew = np.where((last < 0) | (last < pose - half), pose - self.serial[rows] % half, anew)
-        every = self.since.copy()
-        every[rows] = np.where(longer | (since == VARIABLE), since, anew)
-        old = np.zeros(len(self), bool)
-        old[rows] = (last < oldest) & self.away[rows].any(axis=(1, 2))
+        every, old = self.since.copy(), np.zeros(len(self), bool)
+        every[rows] = since
+        old[rows] = (self.pose[rows].max(axis=1) < oldest) & self.away[rows].any(axis=(1, 2))
         if old.any():
             self = self.without_measurements(old)
         away = self.away.copy()
@@ -88,9 +91,11 @@ class SmootherLandmarks(LandmarkRows):
         return replace(self, z=zs, pose=poses, away=away, since=every)
 
     def with_variables(
-        self, rows: IndexArray, z: Array, pose: int, track: int, most: int, T: Array, ratio: float
+        self, rows: IndexArray, last: IndexArray, z: Array, age: int, track: int, most: int, T: Array, ratio: float
     ) -> Self:
         """With more landmarks as variables, of those that a pose T (4, 4) is about to measure (M, 3); at most so many.
+
+        The pose is of an `age`, and those that measured the landmarks last are of ages `last` (S,), −1 for none.
 
         Where it measures more, none becomes one: many landmarks that come and go hold the path well enough, at half the
         cost. A landmark becomes a variable when its smart factor is full: then it keeps what that says of it, as the
@@ -104,17 +109,17 @@ class SmootherLandmarks(LandmarkRows):
         """
         if len(rows) > most:
             return self
-        last, variable, since = self.pose.max(axis=1), self.since == VARIABLE, self.since.copy()
+        variable, since = self.since == VARIABLE, self.since.copy()
         deviation = np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2))
         offset = np.linalg.norm(self.position[rows] - self.linearised[rows], axis=1)
         apart = ratio * np.where(variable[rows], offset, deviation)
         nonlinear = apart >= np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
-        full = ~variable[rows] & (since[rows] <= pose - track) & (last[rows] >= pose - max(track // 2, 1))
+        full = ~variable[rows] & (since[rows] <= age - track) & (last[rows] >= age - max(track // 2, 1))
         new = rows[full & ~nonlinear & np.isfinite(z[:, 2])]
-        leaving = np.flatnonzero(variable & (last < pose - track))
+        leaving = np.flatnonzero(variable & (last < age - track))
         leaving = leaving[np.argsort(last[leaving], kind="stable")][: max(int(variable.sum()) + len(new) - most, 0)]
         new = np.sort(new)[: most - int(variable.sum()) + len(leaving)]
-        since[leaving] = since[rows[variable[rows] & nonlinear]] = 0
+        since[leaving] = since[rows[variable[rows] & nonlinear]] = age - track  # full
         since[new] = VARIABLE
         linearised = self.linearised.copy()
         linearised[new] = self.position[new]
@@ -126,9 +131,9 @@ class SmootherLandmarks(LandmarkRows):
         position[rows], at[rows] = points, linearised
         return replace(self, position=position, linearised=at)
 
-    def without_variables(self, pose: int) -> Self:
-        """With smart factors that begin at pose number `pose` in place of all variables."""
-        return replace(self, since=np.where(self.since == VARIABLE, pose, self.since))
+    def without_variables(self, age: int) -> Self:
+        """With smart factors that begin at an age in place of all variables."""
+        return replace(self, since=np.where(self.since == VARIABLE, age, self.since))
 
     def left_behind(self, rows: IndexArray, T: Array, drift: Array) -> Self:
         """After a pose T (4, 4) that measured only the landmarks `rows`, and is off by a drift (6, 6) from the last."""

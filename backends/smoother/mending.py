@@ -29,7 +29,7 @@ def corrected(s: SmootherState, correct: Callable[[Array], Array]) -> SmootherSt
 
 
 def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
-    """The last poses after a correction: the newest one stays where it is, the others and the landmarks move."""
+    """The last poses after a correction; unless landmarks are known in the world, the newest one stays where it is."""
     s = anchored(s)
     marks, oldest = s.landmarks, s.oldest(steps.config.lag, s.number)
     try:

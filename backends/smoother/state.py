@@ -67,7 +67,7 @@ class SmootherState:
     serials: int = 0  # number of landmarks so far
     known: Mapping[int, Known] = field(default_factory=dict)  # by serial number
     left_stamps: Array = field(default_factory=lambda: np.zeros(0))  # times of poses that are kept no more (N,) [s]
-    left_poses: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # and these, which are final
+    left_poses: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # and these, in no order
     measured: bool = False  # whether the newest pose may not be updated any more
     revisions: int = 0  # how often the measurements were revised
     contradicted: int = 0  # updates in succession in which most observations agreed on another pose than expected
@@ -122,6 +122,11 @@ class SmootherState:
         """Row of a pose."""
         return number - self.first
 
+    def age(self, numbers: IndexArray | int) -> IndexArray:
+        """`ages` of poses, −1 of one that is not kept."""
+        rows = np.asarray(numbers) - self.first
+        return np.where(rows < 0, -1, self.ages[np.maximum(rows, 0)])
+
     def oldest(self, lag: int | None, newest: int) -> int:
         """Number of the oldest pose in the graph, once it has the newest one of such a number."""
         least = max(self.begun, self.first)
@@ -134,10 +139,24 @@ class SmootherState:
         oldest = self.oldest(lag, self.number)
         gone = max(self.of(oldest) - past, 0)
         return replace(
-            self, first=self.first + gone, poses=self.poses[gone:], stamps=self.stamps[gone:], rests=self.rests[gone:],
-            ages=self.ages[gone:], sights=self.sights[gone:], spread=self.spread[gone:],
-            left_stamps=np.append(self.left_stamps, self.stamps[:gone]),
-            left_poses=np.concatenate([self.left_poses, self.poses[:gone]]),
+            self._without(np.arange(gone)), first=self.first + gone,
             landmarks=self.landmarks.folded(self.first + gone, oldest),
             known={k: one for k, one in self.known.items() if not 0 <= one.pose < self.first + gone},
+        )  # fmt: skip
+
+    def without_dark(self, keep: int) -> SmootherState:
+        """Without the poses after the anchor but the last ones, so many: the motion over the others is one step."""
+        begin, end = self.of(self.anchor) + 1, len(self.poses) - keep
+        rests = self.rests.copy()
+        rests[end] = rests[begin : end + 1].all()
+        return replace(self, rests=rests)._without(np.arange(begin, end))
+
+    def _without(self, rows: IndexArray) -> SmootherState:
+        """Without what is kept of some poses; these and their times stay in the path."""
+        names, gone = ("poses", "stamps", "rests", "ages", "spread"), set(rows.tolist())
+        return replace(
+            self, **{name: np.delete(getattr(self, name), rows, 0) for name in names},
+            sights=tuple(one for row, one in enumerate(self.sights) if row not in gone),
+            left_stamps=np.append(self.left_stamps, self.stamps[rows]),
+            left_poses=np.concatenate([self.left_poses, self.poses[rows]]),
         )  # fmt: skip

@@ -21,7 +21,7 @@ from slam.window.gating import MIN_CONSENSUS
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.stereo import RectifiedMeasurement
 
-_DARK = 100  # frames without a measurement after which the problem begins anew: they would be poses of the graph
+_DARK = 100  # cost: frames without a measurement after which half of them leave: they would be poses of the graph
 _SAME = 0.5  # share of a pose's landmarks that another one must measure to say nothing new
 
 
@@ -41,7 +41,7 @@ class Steps(RectifiedMeasurement):
     def predicted(self, s: SmootherState, stamp: float, rests: bool = False) -> SmootherState:
         """With the newest frame at `stamp` [s], by the motion model."""
         if s.started and self.config.lag is not None and s.number - s.anchor >= _DARK:
-            s = _without_dark(s).without_old(self.config.past, self.config.lag)
+            s = s.without_dark(_DARK // 2)
         s = replace(
             s, stamps=np.append(s.stamps, stamp), rests=np.append(s.rests, rests),
             sights=(*s.sights, Sight.none()), measured=False,
@@ -87,7 +87,8 @@ class Steps(RectifiedMeasurement):
                 one, start, lambda: landmarks_pose(self, one.points, z, one.predicted, s.number), s.contradicted, lost
             )
             s = replace(s, contradicted=found.contradicted)
-            if not found.used.any():
+            few = found.used.sum() < MIN_CONSENSUS and unknown_turn(s.relative)  # linearised where it may not be
+            if few or not found.used.any():
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", ids.copy())
             after, nis, why = self._corrected(s, graph, one, found, rows, z)
         except (np.linalg.LinAlgError, SolverError) as error:
@@ -123,12 +124,14 @@ class Steps(RectifiedMeasurement):
             if np.linalg.eigvals(np.linalg.solve(one.information, information)).real.min() > 1:  # more than the motion
                 return _alone(s, found.T, information), nis, ""
         ratio = math.sqrt(self.stereo.f / self.models.pixel_sigma)
-        marks = s.landmarks.with_variables(seen, one.z, number, self.track, self.config.landmarks, found.T, ratio)
-        after = replace(_seeing(s), landmarks=marks, poses=np.concatenate([s.poses[:-1], found.T[None]]))
-        after = self._measured(after, seen, one.z, s.oldest(self.config.lag, number))
+        after = replace(_seeing(s), poses=np.concatenate([s.poses[:-1], found.T[None]]))
+        last, age = s.age(marks.pose.max(axis=1, initial=-1)), int(after.ages[-1])
+        marks = s.landmarks.with_variables(seen, last, one.z, age, self.track, self.config.landmarks, found.T, ratio)
+        after = replace(after, landmarks=marks)
+        after = self._measured(after, seen, one.z, s.oldest(self.config.lag or SmootherConfig.lag, number))
         solved, why = graph.followed(after)
         after = self.settled(after, solved)
-        marks = after.landmarks.without_variables(number) if why else after.landmarks
+        marks = after.landmarks.without_variables(age) if why else after.landmarks
         return replace(after, landmarks=marks.left_behind(seen, after.poses[-1], solved.drift)), nis, why
 
     def _considered(self, s: SmootherState, one: pose_only.PoseProblem, T: Array, seen: IndexArray) -> SmootherState:
@@ -148,8 +151,10 @@ class Steps(RectifiedMeasurement):
 
     def _measured(self, s: SmootherState, rows: IndexArray, z: Array, oldest: int) -> SmootherState:
         """With measurements z (M, 3) of landmarks from the newest pose; see `SmootherLandmarks.measured`."""
-        marks = s.landmarks.measured(rows, z, s.number, self.track, oldest, s.solved)
-        sight = s.sights[-1].joined(Sight(marks.serial[rows], marks.since[rows], z))
+        marks, age = s.landmarks, int(s.ages[-1])
+        since = marks.spans(rows, s.age(marks.pose[rows].max(axis=1)), age, self.track, int(s.age(s.solved)))
+        marks = marks.measured(rows, z, s.number, since, oldest)
+        sight = s.sights[-1].joined(Sight(marks.serial[rows], since, z))
         return replace(s, landmarks=marks, sights=(*s.sights[:-1], sight))
 
     def _saw_the_same(self, s: SmootherState, serials: IdArray) -> bool:
@@ -230,10 +235,10 @@ def _begun(s: SmootherState, T: Array, P: Array) -> SmootherState:
 
     Landmarks go on as they stand; what they were measured from is no part of it.
     """
+    marks = s.landmarks.without_measurements(np.ones(len(s.landmarks), bool)).without_variables(int(s.ages[-1]))
     return replace(
         s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread[:-1], P[None]]),
-        joint=joint.alone(P), prior=P, start=T, begun=s.number, anchor=s.number,
-        landmarks=s.landmarks.without_measurements(np.ones(len(s.landmarks), bool)),
+        joint=joint.alone(P), prior=P, start=T, begun=s.number, anchor=s.number, landmarks=marks,
         known={serial: one for serial, one in s.known.items() if one.pose < 0},
     )  # fmt: skip
 
@@ -255,25 +260,17 @@ def _alone(s: SmootherState, T: Array, information: Array) -> SmootherState:
 def anchored(s: SmootherState) -> SmootherState:
     """With the newest pose as the anchor, where it is predicted if nothing was measured.
 
-    Nothing but the motion ties it to the last: where it may have turned anyhow, the problem begins anew.
+    Nothing but the motion ties it to the last: where it may have turned anyhow, the problem begins anew. The motion's
+    covariance, which is linear in the turn, is of no direction then.
     """
     if s.anchor == s.number:
         return s
     s = _left_behind(s)
     if unknown_turn(s.relative):
-        return _begun(s, s.poses[-1], s.spread[-1])
+        largest = [np.linalg.eigvalsh(s.spread[-1][part, part]).max() for part in (slice(3), slice(3, 6))]
+        return _begun(s, s.poses[-1], 2 * np.diag(np.repeat(largest, 3)))
     by_anchor = adjoint(inverse(s.poses[-1]) @ s.poses[s.of(s.anchor)])
     return replace(s, joint=joint.anchored(s.joint, by_anchor, s.poses[-2:]), anchor=s.number)
-
-
-def _without_dark(s: SmootherState) -> SmootherState:
-    """With the newest pose, which measured nothing, as the first of a problem; landmarks are known from it."""
-    s = _left_behind(s)
-    s, rows = _begun(s, s.poses[-1], s.spread[-1]), np.flatnonzero(~s.landmarks.world)
-    marks = s.landmarks
-    local, own = pose_only.seen_from(s.poses[-1], marks.position[rows], marks.from_newest[rows])
-    known = {n: Known(x, P, s.number) for n, x, P in zip(marks.serial[rows].tolist(), local, own)}
-    return replace(s, known={**s.known, **known})
 
 
 def _left_behind(s: SmootherState) -> SmootherState:

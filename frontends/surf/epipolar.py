@@ -141,27 +141,26 @@ def _correlate(image, stride, y, first, count, own, space):
 
 
 @vector_helper
-def _fold(scores, quarter, folded):
-    """The largest of each four scores that are a quarter of a row apart: looking at each score would take longer."""
+def _fold(scores, count, folded):
+    """Of each four scores that are a quarter of the row apart the largest: to look at each score would take longer.
+
+    Returns how many there are, the largest of all, and its column. Scores behind the row are overwritten.
+    """
+    quarter = (count + 3) // 4
+    for j in range(count, 4 * quarter):
+        scores[j] = np.float32(-1.0)
     for j in range(quarter):
         k, step = np.uint64(j), np.uint64(quarter)
         a, b, c, d = scores[k], scores[k + step], scores[k + step + step], scores[k + step + step + step]
         folded[k] = max(max(a, b), max(c, d))
-
-
-@helper
-def _first_largest(scores, count, folded, quarter):
-    """Largest of the first scores, and the first column that has it."""
-    largest, column = folded[0], count
+    largest, column = folded[0], 0
     for j in range(1, quarter):
         largest = max(largest, folded[j])
-    for j in range(quarter):
-        if folded[j] == largest:
-            for k in range(j, column, quarter):
-                if scores[k] == largest:
-                    column = k
-                    break
-    return largest, column
+    while folded[column] != largest:
+        column += 1
+    while scores[column] != largest:
+        column += quarter
+    return quarter, largest, column
 
 
 @vector_helper
@@ -231,14 +230,10 @@ def _search(image, shape, band, y, first, last, own, limits, space):
     scores, folded, (rows, stride) = space.scores, space.folded, shape
     min_correlation, uniqueness, unresolved = limits
     count, one = last - first + 1, np.float32(1.0)
-    quarter = (count + 3) // 4
     found, row, score, height, rival = -1, -1, np.float32(-1.0), np.float32(-1.0), np.float32(-1.0)
     for v in range(max(y - band, _HALF), min(y + band, rows - 1 - _HALF) + 1):
         _correlate(image, stride, v, first, count, own, space)
-        for j in range(count, 4 * quarter):
-            scores[j] = -one
-        _fold(scores, quarter, folded)
-        largest, best = _first_largest(scores, count, folded, quarter)
+        quarter, largest, best = _fold(scores, count, folded)
         better = largest > score
         if better:
             if abs(first + best - found) > _NEIGHBOURS:

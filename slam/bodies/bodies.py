@@ -169,7 +169,8 @@ def returned(body: Body, T: Array, slot: int, stamp: float) -> Body:
 def continued(body: Body, known: Body) -> Body:
     """A new body that turns out to be a known one takes over its id and predicted frame; the estimate begins anew.
 
-    The frame is shifted from the middle of the part seen before to that of the part seen now; the extent is none yet.
+    The frame is shifted from the middle of the part seen before to that of the part seen now. Its extent is to be taken
+    anew.
     """
     frame = known.T.copy()
     frame[:3, 3] += body.middle - known.middle

@@ -179,12 +179,6 @@ def row_times(M, i, v):
 
 
 @helper
-def column_times(M, i, v):
-    """Entry i of ``Mᵀ v`` for v (3,)."""
-    return M[0, i] * v[0] + M[1, i] * v[1] + M[2, i] * v[2]
-
-
-@helper
 def assign(M, out):
     """Copy a matrix: ``out[:] = M`` makes Numba compile messages about shapes, for as long as a large kernel."""
     for i in range(out.shape[0]):

@@ -171,7 +171,7 @@ def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) 
     torn = faster[(faster > _AT_ONCE) & (needs > max(_BRAKES, _RARE * float(np.median(needs))))]
     if len(torn):
         return (
-            f"the velocity changes by {_rounded(float(torn.max()))} m/s from one frame to the next, as no camera's "
+            f"the velocity changes by {_rounded(float(torn.max()))} m/s between measured frames, as no camera's "
             "does: images are missing, come twice or are exchanged there, or something large that moved was taken for "
             "the world"
         )

@@ -20,21 +20,23 @@ _VARIABLES = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "MALLOC_ARENA_
 
 
 @cache
-def keep_freed_memory() -> bool:
-    """Have the process keep up to 128 MB that were freed, in two heaps; says whether that could be set.
+def keep_freed_memory() -> None:
+    """Have the process keep up to 128 MB that were freed, in two heaps.
 
-    It cannot where the C library is another than glibc. Where one of glibc's environment variables for it is set, that
-    is left as it is.
+    Nothing is changed where the C library is another than glibc, or one of its environment variables for that is set.
     """
-    if sys.platform != "linux" or any(name in os.environ for name in _VARIABLES):
-        return False
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    wanted = (_TRIM, _KEPT), (_MMAP, _LARGE), (_ARENAS, _HEAPS)
-    return mallopt is not None and all([mallopt(number, value) for number, value in wanted])
+    if not any(name in os.environ for name in _VARIABLES):
+        for parameter, value in ((_TRIM, _KEPT), (_MMAP, _LARGE), (_ARENAS, _HEAPS)):
+            _call("mallopt", parameter, value)
 
 
 def give_back_freed_memory() -> None:
-    """Give the system what is free, before something else than frames needs memory; nothing where that cannot be."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
-    if trim is not None:
-        trim(0)
+    """Give the system what is free, before something else than frames needs memory."""
+    _call("malloc_trim", 0)
+
+
+def _call(name: str, *numbers: int) -> None:
+    """Call a function of glibc, where that is the C library."""
+    function = getattr(ctypes.CDLL(None), name, None) if sys.platform == "linux" else None
+    if function is not None:
+        function(*numbers)

@@ -141,7 +141,7 @@ def test_a_prior_maps_features_slide_up_to_the_first_sight_and_on(share):
     assert walked(0.5) == pytest.approx(first + 3.0**2 * np.arctan(0.1), rel=0.02)
 
 
-@pytest.mark.parametrize(("frames", "atol"), [(12, 1e-3), (30, 1e-2)])  # of 15 mm; with the lag, less is known
+@pytest.mark.parametrize(("frames", "atol"), [(12, 1e-3), (30, 1.2e-2)])  # of 15 mm; with the lag, less is known
 def test_the_smoother_keeps_what_was_known_when_it_is_rebuilt(frames, atol):
     """And counts nothing twice: neither what the first pose measured, nor what is known of the landmarks."""
     scene, last = Scene(frames), frames - 7

@@ -18,7 +18,7 @@ from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels, MotionModel
 from slam.window import motion
 from slam.window.stereo import RectifiedStereo
-from tests.backends.scenes import RIG, path, random_path, run, scene, step, with_far_points
+from tests.backends.scenes import RIG, observe, path, random_path, run, scene, step, with_far_points
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
 DT = 0.1
@@ -93,7 +93,7 @@ def test_far_landmarks_that_soon_leave_are_not_believed_too_much(seen_at_once, s
 def test_points_at_a_disparity_of_noise_do_not_rebuild_the_graph():
     """Noise puts some behind a camera, which gtsam's factor throws at: the graph was built anew once every lag."""
     backend = SmootherBackend(RIG, EstimatorModels(MotionModel(1.0, 0.3), 0.7, initial_velocity_sigma=15.0))
-    assert not any(report.reason for report in run(backend, with_far_points(40, 8.0))[1:]) and backend.rebuilds == 0
+    assert not any(report.reason for report in run(backend, with_far_points(40, 8.0))[1:])
 
 
 def enter(backend, k: int, stamp: float, seen: Observations) -> None:
@@ -132,7 +132,6 @@ def test_frames_that_measured_nothing_are_no_failure(lag, dark):
         report = step(backend, stamp, seen, known)
         assert not k or (report.status is UpdateStatus.OK and not report.reason), (k, report.reason)
         assert len(report.rejected) < 3
-    assert backend.rebuilds == 0
     last = backend.estimate(landmarks=False)
     off = se3.log(se3.inverse(last.T_world_left) @ data.poses[-1])
     assert off @ np.linalg.solve(last.covariance, off) < 25
@@ -288,15 +287,54 @@ def test_landmarks_that_are_variables_outlast_more_than_a_lag_of_frames_that_mea
         if 40 <= k < 50:
             enter(backend, k, stamp, seen)
         else:
-            step(backend, stamp, seen, known)
+            assert not (step(backend, stamp, seen, known).reason and k), "it is not built anew"
         if k == 39:
             before, variables = backend.estimate(landmarks=False), backend.state.landmarks.since == VARIABLE
     after = backend.estimate(landmarks=False)
-    assert backend.rebuilds == 0 and variables.sum() >= 4
+    assert variables.sum() >= 4
     assert (backend.state.landmarks.since[: len(variables)] == VARIABLE)[variables].all()
     deviations = [np.sqrt(np.trace(e.covariance[3:, 3:])) for e in (before, after)]
     assert deviations[1] < 1.5 * deviations[0], deviations
     assert errors(after.T_world_left, data.poses[-1])[0] < 3 * deviations[1]
+
+
+@pytest.mark.parametrize(("every", "frames"), [(9, 118), (20, 121)])
+def test_frames_that_measure_are_held_together_however_many_lie_between(every, frames):
+    """Each landmark's factor was taken for one that had not been measured for long: sigma was 1.7 to 5.7 m."""
+    poses, known = path(frames, DT, np.array([0.0, 0.0, 0.4]), np.array([0.0, 0.03, 0.0])), set()
+    backend = SmootherBackend(RIG, MODELS)
+    for k, (stamp, _, seen) in enumerate(scene(poses, points=300, limit=40)):
+        step(backend, stamp, Observations.empty() if k % every else seen, known)
+    last = backend.estimate(landmarks=False)
+    deviation = np.sqrt(np.trace(last.covariance[3:, 3:]))
+    assert errors(last.T_world_left, poses[-1])[0] < 3 * deviation < 0.1
+
+
+def test_the_map_is_where_it_was_after_a_hundred_frames_in_the_dark():
+    """The problem began anew with the pose as predicted: it and the map were 2.2 m off from then on."""
+    models = EstimatorModels(
+        MotionModel(0.05, 0.02), 0.5, initial_velocity_sigma=0.1, initial_angular_velocity_sigma=0.05
+    )
+    data, backend, known = swaying(140, 40), SmootherBackend(RIG, models), set()
+    for k, (stamp, _, seen) in enumerate(data):
+        step(backend, stamp, Observations.empty() if 20 <= k < 130 else seen, known)
+    last = backend.estimate(landmarks=False)
+    assert errors(last.T_world_left, data.poses[-1])[0] < 3 * np.sqrt(np.trace(last.covariance[3:, 3:])) < 0.1
+    assert backend.trajectory().stamps.tolist() == data.stamps.tolist()
+
+
+def test_landmarks_that_return_after_a_lap_are_measured_again_without_a_lag():
+    """What the camera had drifted since did not count: 16 good measurements were refused."""
+    models, refused = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=1.0), 0
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        rays = rng.standard_normal((400, 3)) * (1, 0.35, 1)
+        points = rays / np.linalg.norm(rays, axis=1)[:, None] * rng.uniform(3, 8, (400, 1))
+        backend, known = SmootherBackend(RIG, models, lag=None), set()
+        for k, T in enumerate(path(130, DT, np.array([0.6, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))):
+            report = step(backend, k * DT, observe(T, points, 1.0, rng, 10), known)
+            refused += len(report.rejected) if k > 62 else 0
+    assert refused < 5
 
 
 # --- measurements that are mended ---
@@ -348,7 +386,7 @@ def test_a_revision_that_changes_nothing_leaves_the_covariances():
     assert (deviations[1] > 0.99 * deviations[0]).all() and (deviations[1] < 1.3 * deviations[0]).all()
     seen = np.isin(before.ids, data.observations[-1].ids)
     sizes = [np.sqrt(np.trace(e.covariances, axis1=1, axis2=2))[seen] for e in (before, after)]
-    np.testing.assert_allclose(sizes[1], sizes[0], rtol=0.12)
+    np.testing.assert_allclose(sizes[1], sizes[0], rtol=0.2)  # they move with the pose that the graph begins with
     assert abs(np.median(sizes[1] / sizes[0]) - 1) < 0.01
 
 

@@ -67,7 +67,6 @@ def test_one_failure_costs_nothing(break_solver, method, error):
     break_solver(method, [11], error)
     backend = SmootherBackend(RIG, MODELS)
     reports = run(backend, data)
-    assert backend.rebuilds == 1
     assert all(r.status is UpdateStatus.OK for r in reports[1:]), "the measurements were used after the rebuild"
     said = [r.reason for r in reports[1:] if r.reason]
     assert len(said) == 1 and said[0].startswith("smoother: built anew after gtsam: ") and "\n" not in said[0]

@@ -75,6 +75,21 @@ def test_unknown_kind_and_unknown_key_in_a_file():
         SystemConfig.from_json({"models": {"motion": None}})
 
 
+def test_a_configuration_comes_back_from_its_json_with_options_of_any_shape():
+    own = {
+        "backend.opt": {"a": {"b": 1}},
+        "backend.none": {},
+        "map.grid": [4, 3],
+        "models.T_world_left": np.eye(4).tolist(),
+    }
+    for config in (SystemConfig(), SystemConfig.for_kind("driving").with_settings(own)):
+        assert SystemConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
+    assert config.backend == {"opt": {"a": {"b": 1}}, "none": {}}
+    for tree in ({"a": {}}, {"map": {"max_landmarks": {}}}):
+        with pytest.raises(ConfigurationError, match=r"'a'|max_landmarks must be a whole number"):
+            SystemConfig.from_json(tree)
+
+
 def test_a_whole_number_in_place_of_a_fraction_is_the_same_setting():
     whole, fraction = (
         SystemConfig().with_settings([f"map.separation={two}", f"association.window_sigmas=[{two}, 4.0]"])

@@ -85,6 +85,16 @@ def test_rectified_twin_has_equal_rows_and_the_same_geometry(seed):
     np.testing.assert_allclose(rectified_rig.unrectify_right(b), right, atol=1e-8)
 
 
+def test_rectification_maps_agree_with_opencv():
+    cv2 = pytest.importorskip("cv2")
+    pair = random_rig(1).rectified
+    size, sides = (pair.original.width, pair.original.height), ((LEFT, pair.R_left), (RIGHT, pair.R_right))
+    for (camera, R), maps in zip(sides, pair.maps):
+        D = np.array(camera.distortion)
+        expected = cv2.initUndistortRectifyMap(camera.K, D, R, pair.rig.left.K, size, cv2.CV_32FC1)
+        np.testing.assert_allclose(maps, expected, atol=1e-3)  # float32 of values up to 752
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
