@@ -45,8 +45,10 @@ def with_changes(config: Any, settings: Sequence[str] | Mapping[str, Any]) -> An
             if not equals:
                 raise ConfigurationError(f"setting {setting!r} is not of the form section.key=value")
             given.append((key.strip(), _value(text.strip()), setting))
-    known, changes = list(dict(leaves(asdict(config)))), dict[str, Any]()
+    known, changes = [key for key, _ in leaves(asdict(config)) if key not in _FREE], dict[str, Any]()
     for key, value, setting in given:
+        if value == {} and (key in _FREE or any(other.startswith(f"{key}.") for other in known)):
+            continue  # a section of which nothing is set
         section, dot, option = key.partition(".")
         if section in _FREE and dot:
             changes.setdefault(section, {})[option] = value
@@ -133,9 +135,13 @@ def _unknown(key: str, known: Sequence[str]) -> str:
 
 
 def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted names of all settings in a configuration's tree, such as ``"map.grid"``, and their values."""
+    """Dotted names of all settings in a configuration's tree, such as ``"map.grid"``, and their values.
+
+    Options of front end and back end may be dicts themselves, and an empty section is a value.
+    """
     for key, value in tree.items():
-        if isinstance(value, dict):
+        section, dot, _ = f"{prefix}{key}".partition(".")
+        if isinstance(value, dict) and value and not (dot and section in _FREE):
             yield from leaves(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value

@@ -144,10 +144,6 @@ class StereoSlam:
         """The present back end; another one takes over after a kidnapping, or in an unknown place."""
         return self._state.backend
 
-    @backend.setter
-    def backend(self, backend: Backend) -> None:
-        self._state = replace(self._state, backend=backend)
-
     @property
     def landmarks(self) -> LandmarkTable | None:
         """The landmarks' bookkeeping after the last step; None before the first."""

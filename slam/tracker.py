@@ -18,6 +18,7 @@ from slam.atlas.map_io import SavedMap
 from slam.bodies.detector import ObjectDetector
 from slam.bodies.estimator import FRAMES
 from slam.calibration import RemainingRigError, SelfCalibration
+from slam.calibration.estimator import SIGNIFICANT
 from slam.config import SystemConfig
 from slam.data import (
     CommonError,
@@ -36,7 +37,7 @@ from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import inverse, twice
 from slam.geometry.trajectory import Trajectory
 from slam.input.warnings import REPEATED
-from slam.interfaces import AligningFrontend, Backend, Frontend, MapBackend, RestingBackend
+from slam.interfaces import AligningFrontend, Backend, Frontend, MapBackend, RestingBackend, RevisingBackend
 from slam.object_data import MovingObject
 from slam.third_party import OnlinePose, checked, recent_of
 from slam.tracks.alignment import align, take_patches
@@ -128,7 +129,7 @@ class Tracker:
 
     def revise(self, state: State) -> Revision | None:
         """Apply the present estimate of the rig's error, also to earlier measurements if the back end can."""
-        change = self.rig_error.apply(state.backend)
+        change = self.calibration.apply(SIGNIFICANT if isinstance(state.backend, RevisingBackend) else 0.0)
         if change is not None and state.tracks is not None:
             self.objects.revise(state.tracks, change.rows)
         return self.rig_error.revise(state.backend, restarted=bool(state.past))

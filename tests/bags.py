@@ -35,9 +35,9 @@ def image(store, stamp: int, pixels: np.ndarray, encoding: str = "mono8", big: b
     )
 
 
-def compressed(store, stamp: int, message):
+def compressed(store, message):
     data = cv2.imencode(".png", message.data.reshape(HEIGHT, -1)[:, :WIDTH])[1].ravel()
-    return store.types[COMPRESSED](header(store, stamp), "png", data)
+    return store.types[COMPRESSED](message.header, "png", data)
 
 
 D = np.array([-0.2, 0.05, 0.001, -0.001, 0.0])

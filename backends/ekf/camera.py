@@ -19,7 +19,6 @@ from slam.models import ANYWHERE, EstimatorModels
 _ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an attitude [rad]
 
 _AT_REST = np.diag(np.repeat([1.0, 0.0], POSE))  # of a camera's error (12,)
-_POSITION = np.diag(np.repeat([1.0, 0.0, 0.0, 0.0], 3))  # of it that of the position
 
 
 class Camera(Protocol):
@@ -106,14 +105,14 @@ def predicted(camera: Camera, models: EstimatorModels, P: Array, dt: float, rest
 
     One that rests keeps its pose, and its velocity is zero for certain. One that may have turned anyhow meanwhile stays
     where it is, as uncertain as the prior of the speed makes it, by `ANYWHERE` at most: more, in one gap, would mean
-    nothing, and leave a double too few digits for the map. Of its error only that of the position has to do with the
-    map still, all of it: by less of one that a wide prior gives both, the map would tell where the world is.
+    nothing, and leave a double too few digits for the map. The error of the pose before stays part of its own: camera
+    and map go on to share what nobody knows of the world's place, and the map does not tell it.
     """
     if rests:
         return camera.stopped(), _AT_REST, np.zeros_like(P)
     if _any_attitude(models, P, dt):
         pose = min(models.initial_velocity_sigma * dt, ANYWHERE), np.pi / np.sqrt(3)
-        return camera.stopped(), _POSITION, from_body_axes(camera, prior(models, pose))
+        return camera.stopped(), _AT_REST, from_body_axes(camera, prior(models, pose))
     camera, A, W = camera.advanced(dt)
     return camera, A, (W * np.repeat(models.motion.velocity_variance(dt), 3)) @ W.T
 

@@ -107,13 +107,11 @@ class Covariance:
         P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
         return replace(self, P=P, by_rig=by_rig)
 
-    def advanced(self, J: Array, noise: Array, by_error: Array, rows: IndexArray, walk: Array) -> Covariance:
-        """As after `camera_moved`, and landmarks (`rows` (M,) of the table) have walked by covariances (M, 3, 3)."""
-        moved, there, known = self.camera_moved(J, noise, by_error), rows < self.correlated, self.known.copy()
-        at = self.numbers(rows[there])
-        moved.P[at[:, :, None], at[:, None, :]] += walk[there]  # nobody else has it yet
-        known[rows[~there] - self.correlated] += walk[~there]
-        return replace(moved, known=known)
+    def walked(self, rows: IndexArray, walk: Array) -> Covariance:
+        """After landmarks (`rows` (M,) of the table, none of those known from elsewhere) walk by (M, 3, 3)."""
+        P, at = self.P.copy(), self.numbers(rows)
+        P[at[:, :, None], at[:, None, :]] += walk
+        return replace(self, P=P)
 
     # --- landmarks join and leave ---
 

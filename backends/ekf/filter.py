@@ -28,6 +28,7 @@ from slam.window.stereo import TOO_LATE, Field, RectifiedMeasurement
 
 #: Standard deviations of a known point between it and its anchor: its coordinates are linear there, it stays Gaussian.
 _STAND_OFF = 100.0
+_FARTHEST_ANCHOR = 1e5  # numerics: from a known point [m]; a landmark's inverse depth keeps clear of its least
 _DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large
 
 
@@ -140,7 +141,8 @@ class LandmarkFilter:
         ids, positions, covariances = known
         anchors = np.tile(np.eye(3, 4), (len(ids), 1, 1))
         anchors[:, :, 3] = positions
-        anchors[:, 2, 3] -= np.maximum(_STAND_OFF * np.sqrt(np.trace(covariances, axis1=1, axis2=2)), 1.0)
+        deviations = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+        anchors[:, 2, 3] -= np.clip(_STAND_OFF * deviations, 1.0, _FARTHEST_ANCHOR)
         new = FilterLandmarks.at(self._coordinates, ids, anchors, positions)
         new = replace(new, sights=np.full((len(ids), 3), np.nan))
         D = new.gauge[:, :, :3]
@@ -178,20 +180,24 @@ class LandmarkFilter:
     revises_path = False
 
     def revise(self, correct: Callable[[Array], Array]) -> None:
-        """See `slam.interfaces.RevisingBackend.revise`: landmarks in view move to where they are seen at from now on.
+        """See `slam.interfaces.RevisingBackend.revise`: landmarks move to where they are seen at from now on.
 
-        The measurements are gone; what they made of the path stays. But landmarks that were placed by pixels as they
-        were corrected before, and seen at pixels as they are now, would look as if the camera had moved. Those of a
-        prior map that were not measured yet were placed by no pixels: they stay.
+        By the camera of their first sight, if not by the present one. The measurements are gone; what they made of the
+        path stays. But landmarks that were placed by pixels as they were corrected before, and seen at pixels as they
+        are now, would look as if the camera had moved. Those of a prior map that were not measured yet were placed by
+        no pixels: they stay.
         """
         s, stereo = replace(self.state, measured=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
-            z, _ = stereo.project(se3.transform(se3.inverse(s.pose), s.landmarks.points))
-            rows = np.flatnonzero(self.rig.left.in_image(z[:, :2])[: s.covariance.correlated])
-            z = stereo.corrected(self.name, z[rows], correct)
-            points = se3.transform(s.pose, stereo.triangulate(z))
+            marks = s.landmarks.select(slice(s.covariance.correlated))
+            z, _ = stereo.project(se3.transform(se3.inverse(s.pose), marks.points))
+            T = np.where(self.rig.left.in_image(z[:, :2])[:, None, None], s.pose[:3], marks.anchors)
+            z, _ = stereo.project(((marks.points - T[:, :, 3])[:, None] @ T[:, :, :3])[:, 0])
+            rows = np.flatnonzero(np.isfinite(z[:, 0]))
+            local = stereo.triangulate(stereo.corrected(self.name, z[rows], correct))
+            points = (T[rows, :, :3] @ local[:, :, None])[:, :, 0] + T[rows, :, 3]
             good = np.isfinite(points).all(axis=1)
-            s = s.displaced(self._coordinates, s.landmarks.ids[rows[good]], points[good])
+            s = s.displaced(self._coordinates, marks.ids[rows[good]], points[good])
         self.state = s
 
     # --- the filter's parts ---
@@ -212,8 +218,9 @@ class LandmarkFilter:
             motion = predicted(s.camera, self.models, s.covariance.camera, stamp - s.stamp, rests)
         T = motion[0].pose
         rows = self._measure.visible(T, s.landmarks.points)
-        after = s.advanced(float(stamp), motion, rows, self._slide)
+        after = s.advanced(float(stamp), motion)
         marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
+        blocks += self._slide.walked(after.landmarks, rows, T[:3, 3])[1]
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
         by_pose = -toward @ (marks.gauge @ displacement(after.camera))  # (M, 3, 6), of them as seen from the camera
         local = (by_pose @ after.covariance.pose + 2 * toward @ cross) @ by_pose.transpose(0, 2, 1)
@@ -233,8 +240,9 @@ class LandmarkFilter:
         rows, z = s.landmarks.rows_of(observations.ids), self._measure.stereo.measure(observations)
         if not self._stereo:
             z[:, 2] = np.nan
+        slid = s.slid(self._slide, rows, (s.pose if guess is None else guess)[:3, 3])
         update = Update(
-            s.camera, s.covariance, s.landmarks.select(rows), rows, z, self._measure, self._coordinates,
+            s.camera, slid.covariance, slid.landmarks.select(rows), rows, z, self._measure, self._coordinates,
             self._iterations,
         )  # fmt: skip
         update = update if guess is None else update.regular_towards(guess)
@@ -248,7 +256,7 @@ class LandmarkFilter:
             if found is None:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids.copy())
-            after = s.corrected(found)
+            after = slid.corrected(found)
         except LinAlgError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self.name}: {error}")
         used = found.used

@@ -44,12 +44,17 @@ class FilterState:
         P = J @ self.covariance.pose @ J.T
         return np.asarray(0.5 * (P + P.T))
 
-    def advanced(self, stamp: float, motion: Motion, rows: IndexArray, slide: Slide) -> FilterState:
-        """At a later time, after a motion of the camera, which sees the landmarks of some rows (M,) then."""
+    def advanced(self, stamp: float, motion: Motion) -> FilterState:
+        """At a later time, after a motion of the camera."""
         camera, J, noise = motion
-        landmarks, walk = slide.walked(self.landmarks, rows, camera.pose[:3, 3])
-        covariance = self.covariance.advanced(J, noise, pose_by_error(self.camera), rows, walk)
-        return FilterState(stamp, self.frame + 1, False, camera, landmarks, covariance)
+        covariance = self.covariance.camera_moved(J, noise, pose_by_error(self.camera))
+        return FilterState(stamp, self.frame + 1, False, camera, self.landmarks, covariance)
+
+    def slid(self, slide: Slide, rows: IndexArray, r: Array) -> FilterState:
+        """With landmarks of some rows (M,) of the state seen from r (3,), and their features slid there."""
+        landmarks, walk = slide.walked(self.landmarks, rows, r)
+        covariance = self.covariance.walked(rows, walk) if walk.any() else self.covariance
+        return replace(self, landmarks=landmarks, covariance=covariance)
 
     # --- landmarks join and leave ---
 

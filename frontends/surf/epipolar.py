@@ -26,6 +26,7 @@ class _Space(NamedTuple):
     row: NDArray[np.float32]  # `ROW`
     patch: NDArray[np.float32]  # what is looked for by rows, each padded with zeros, its mean removed
     scores: NDArray[np.float32]  # correlations with the places along a row
+    folded: NDArray[np.float32]  # see `_fold`
 
 
 class HalfImage(NamedTuple):
@@ -140,17 +141,26 @@ def _correlate(image, stride, y, first, count, own, space):
 
 
 @vector_helper
-def _largest(scores, count):
-    """Largest of the first scores, and the first column that has it."""
-    a = b = c = d = scores[0]
-    for j in range(0, count - 3, 4):  # four chains: each step of one waits for the step before
-        a, b, c, d = max(a, scores[j]), max(b, scores[j + 1]), max(c, scores[j + 2]), max(d, scores[j + 3])
-    for j in range(count - count % 4, count):
-        a = max(a, scores[j])
-    largest, column = max(max(a, b), max(c, d)), 0
-    while scores[column] != largest:
+def _fold(scores, count, folded):
+    """Of each four scores that are a quarter of the row apart the largest: to look at each score would take longer.
+
+    Returns how many there are, the largest of all, and its column. Scores behind the row are overwritten.
+    """
+    quarter = (count + 3) // 4
+    for j in range(count, 4 * quarter):
+        scores[j] = np.float32(-1.0)
+    for j in range(quarter):
+        k, step = np.uint64(j), np.uint64(quarter)
+        a, b, c, d = scores[k], scores[k + step], scores[k + step + step], scores[k + step + step + step]
+        folded[k] = max(max(a, b), max(c, d))
+    largest, column = folded[0], 0
+    for j in range(1, quarter):
+        largest = max(largest, folded[j])
+    while folded[column] != largest:
         column += 1
-    return largest, column
+    while scores[column] != largest:
+        column += quarter
+    return quarter, largest, column
 
 
 @vector_helper
@@ -217,12 +227,13 @@ def _search(image, shape, band, y, first, last, own, limits, space):
     between columns, of which there may be one between any two: a wrong place of a repeated pattern on a whole column
     looks better than the true one between two.
     """
-    scores, (min_correlation, uniqueness, unresolved), (rows, stride) = space.scores, limits, shape
+    scores, folded, (rows, stride) = space.scores, space.folded, shape
+    min_correlation, uniqueness, unresolved = limits
     count, one = last - first + 1, np.float32(1.0)
     found, row, score, height, rival = -1, -1, np.float32(-1.0), np.float32(-1.0), np.float32(-1.0)
     for v in range(max(y - band, _HALF), min(y + band, rows - 1 - _HALF) + 1):
         _correlate(image, stride, v, first, count, own, space)
-        largest, best = _largest(scores, count)
+        quarter, largest, best = _fold(scores, count, folded)
         better = largest > score
         if better:
             if abs(first + best - found) > _NEIGHBOURS:
@@ -232,17 +243,18 @@ def _search(image, shape, band, y, first, last, own, limits, space):
             continue
         harmless = one - unresolved - (one - score) / uniqueness  # a rival up to this height is none
         least, own_place = np.float32(_CONTENDER) * harmless, best if better else -1
-        for j in range(count):
-            s, itself = scores[j], j == own_place
-            if not itself and (s < least or abs(first + j - found) <= _NEIGHBOURS):
-                continue
-            before, after = scores[j - 1] if j > 0 else s, scores[j + 1] if j < count - 1 else s
-            side = -1 if s >= before > after and first + j > _HALF else 1
-            top = _height(image, stride, v, first + j, own, s, side, space)
-            if itself:
-                height = top
-            else:
-                rival = max(rival, top)
+        for f in range(quarter):
+            for j in range(f, count if folded[f] >= least else 0, quarter):
+                s, itself = scores[j], j == own_place
+                if not itself and (s < least or abs(first + j - found) <= _NEIGHBOURS):
+                    continue
+                before, after = scores[j - 1] if j > 0 else s, scores[j + 1] if j < count - 1 else s
+                side = -1 if s >= before > after and first + j > _HALF else 1
+                top = _height(image, stride, v, first + j, own, s, side, space)
+                if itself:
+                    height = top
+                else:
+                    rival = max(rival, top)
     if score < min_correlation or one - height > uniqueness * (one - rival - unresolved):
         return -1, -1
     return found, row
@@ -261,7 +273,8 @@ def search_rows(left, right, uv, low, high, band, min_correlation, uniqueness, r
     low, high = 0.5 * low, 0.5 * high
     height, width = left.shape
     least, most = np.float32(min_correlation), np.float32(uniqueness)
-    space = _Space(row, np.empty(_SIDE * _LANES, np.float32), np.empty(width + _LANES, np.float32))
+    scores, folded = np.empty(width + _LANES, np.float32), np.empty(width, np.float32)
+    space = _Space(row, np.empty(_SIDE * _LANES, np.float32), scores, folded)
     for i in range(len(uv)):
         px, py = 0.5 * (uv[i, 0] - 0.5), 0.5 * (uv[i, 1] - 0.5)
         x, y = int(np.rint(px)), int(np.rint(py))

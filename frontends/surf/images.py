@@ -81,18 +81,11 @@ def integral_image(image: NDArray) -> NDArray[np.int32]:
     """
     if not image.size:
         return np.zeros((image.shape[0] + 1, image.shape[1] + 1), np.int32)
+    import cv2
+
     if image.dtype != np.uint8:  # exact below 2**53
-        return float_integral_image(image).astype(np.int64).astype(np.int32)
-    import cv2
-
+        return cv2.integral(image, sdepth=cv2.CV_64F).astype(np.int64).astype(np.int32)
     return cv2.integral(image, sdepth=cv2.CV_32S)
-
-
-def float_integral_image(image: NDArray) -> NDArray[np.float64]:
-    """The same of a grey image that is not empty, in float64, which may be interpolated: no sum wraps around."""
-    import cv2
-
-    return cv2.integral(image, sdepth=cv2.CV_64F)
 
 
 def following_white(image: NDArray, last: float) -> float:

@@ -26,24 +26,41 @@ _WEIGHT = np.array([-1.0, -1.0, -1.0, 3.0, 1.0, 1.0, -3.0, 1.0, -1.0, 1.0])
 
 
 @vector_helper
-def _line(pixels, at, stride, part):
-    """Sum of the image above and left of a pixel corner, between two rows."""
-    return pixels[at] + part * (pixels[at + stride] - pixels[at])
+def _sums(p, corners):
+    """Vertical part of the filters for Dxx, Dyy and Dxy on whole rows: sums of all that is left of ten corners."""
+    a0, a1, a2, a3, a4, a5, a6, a7, a8, a9 = corners
+    whole, lobe = np.int32(p[a9] - p[a0]), np.int32(p[a6] - p[a3])
+    xy = np.int32(np.int32(p[a4] - p[a1]) - np.int32(p[a8] - p[a5]))
+    return np.int32(p[a7] - p[a2]), np.int32(whole - np.int32(3) * lobe), xy
+
+
+@vector_helper
+def _part(p, at, stride, part):
+    """Part of a row of the image, summed up to a pixel corner."""
+    return part * np.int32(p[at + stride] - p[at])
 
 
 @disjoint_vector_helper
 def _vertical_parts(p, s, a, f, n, out, lanes):
-    """Vertical part of the filters for Dxx, Dyy and Dxy, from the lines at the ten rows of corners, on n columns."""
+    """Vertical part of the filters for Dxx, Dyy and Dxy, from the lines at the ten rows of corners, on n columns.
+
+    Whole rows count from the first of the columns, so that none of their sums wraps around.
+    """
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9 = a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8], a[9]
     f0, f1, f2, f3, f4, f5, f6, f7, f8, f9 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9]
+    first_xx, first_yy, first_xy = _sums(p, (a0, a1, a2, a3, a4, a5, a6, a7, a8, a9))
     for j in range(n):
         k = np.uint64(j)
-        lobe = _line(p, a6 + k, s, f6) - _line(p, a3 + k, s, f3)
-        upper = _line(p, a4 + k, s, f4) - _line(p, a1 + k, s, f1)
-        lower = _line(p, a8 + k, s, f8) - _line(p, a5 + k, s, f5)
-        out[k] = _line(p, a7 + k, s, f7) - _line(p, a2 + k, s, f2)
-        out[lanes + k] = _line(p, a9 + k, s, f9) - _line(p, a0 + k, s, f0) - 3.0 * lobe
-        out[lanes + lanes + k] = upper - lower
+        xx, yy, xy = _sums(p, (a0 + k, a1 + k, a2 + k, a3 + k, a4 + k, a5 + k, a6 + k, a7 + k, a8 + k, a9 + k))
+        whole, lobe = (
+            _part(p, a9 + k, s, f9) - _part(p, a0 + k, s, f0),
+            _part(p, a6 + k, s, f6) - _part(p, a3 + k, s, f3),
+        )
+        upper = _part(p, a4 + k, s, f4) - _part(p, a1 + k, s, f1)
+        lower = _part(p, a8 + k, s, f8) - _part(p, a5 + k, s, f5)
+        out[k] = np.int32(xx - first_xx) + (_part(p, a7 + k, s, f7) - _part(p, a2 + k, s, f2))
+        out[lanes + k] = np.int32(yy - first_yy) + (whole - 3.0 * lobe)
+        out[lanes + lanes + k] = np.int32(xy - first_xy) + (upper - lower)
 
 
 @vector_helper
@@ -126,7 +143,8 @@ def localise(integral, uv, size, reach):
     """Maximum of the response next to each feature with pixel (N, 2) and size (N,) [px], continuous in both.
 
     Returns (N, 4): x, y, size [px] and the response, for the image's own pixel values; NaN where there is no maximum in
-    `reach` of the feature, in units of its size, or where the filter would leave the image of the float `integral`.
+    `reach` of the feature, in units of its size, or where the filter would leave the image of the `integral`, see
+    `integral_image`.
     """
     out, largest = np.full((len(uv), 4), np.nan), 0.0
     for i in range(len(size)):

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.runtime.compilation import helper, kernel, vector_helper
 
@@ -15,21 +12,12 @@ _BINS = 144  # fixed: two for each five degrees: the degree 5k alone, and the fo
 _WINDOW = 23  # fixed: bins in 60 degrees, the ends left out
 
 
-class Disc(NamedTuple):
-    """Samples of the disc, and the bins of whole degrees."""
-
-    places: NDArray[np.uint64]  # numbers of the samples' columns and rows (113, 2), from 0
-    weights: NDArray[np.float32]  # their Gaussian weights (113,)
-    bins: NDArray[np.uint64]  # bin of each degree 0..360 (361,), counted from the first window's first one
-
-
 _LINE, _DEGREES = np.arange(-RADIUS, RADIUS + 1), np.arange(361) % 360
-_PLACES = np.argwhere(_LINE[:, None] ** 2 + _LINE[None] ** 2 <= RADIUS**2)
+_PLACES = np.argwhere(_LINE[:, None] ** 2 + _LINE[None] ** 2 <= RADIUS**2).astype(np.uint64)  # samples: column, row
 _WEIGHT = np.exp(-(_LINE**2) / (2 * _SIGMA**2))
-DISC = Disc(
-    _PLACES.astype(np.uint64), (_WEIGHT / _WEIGHT.sum())[_PLACES].prod(axis=1).astype(np.float32),
-    ((2 * (_DEGREES // 5) + (_DEGREES % 5 > 0) + _WINDOW // 2) % _BINS).astype(np.uint64),
-)  # fmt: skip
+_WEIGHTS = (_WEIGHT / _WEIGHT.sum())[_PLACES.astype(int)].prod(axis=1).astype(np.float32)  # of the samples (113,)
+#: Bin of each degree, counted from the first window's first one.
+_BIN = ((2 * (_DEGREES // 5) + (_DEGREES % 5 > 0) + _WINDOW // 2) % _BINS).astype(np.uint64)
 
 
 @vector_helper
@@ -52,7 +40,7 @@ def _degrees(x, y, out, n):
 
 
 @helper
-def _sample_gradients(pixels, rows, stride, x, y, s, disc, space):
+def _sample_gradients(pixels, rows, stride, x, y, s, space):
     """Weighted Haar wavelet responses (x right, y UP) of the samples inside the image; returns how many there are."""
     lefts, tops, gx, gy = space[:4]
     half = int(np.rint(2.0 * s))
@@ -64,8 +52,8 @@ def _sample_gradients(pixels, rows, stride, x, y, s, disc, space):
     h, e = np.uint64(half), np.uint64(side)
     centre, bottom = np.uint64(half * stride), np.uint64(side * stride)
     n = np.uint64(0)
-    for k in range(disc.weights.size):
-        first = lefts[disc.places[k, 0]] + tops[disc.places[k, 1]]
+    for k in range(_WEIGHTS.size):
+        first = lefts[_PLACES[k, 0]] + tops[_PLACES[k, 1]]
         if first < 0:
             continue
         a = np.uint64(first)
@@ -74,7 +62,7 @@ def _sample_gradients(pixels, rows, stride, x, y, s, disc, space):
         left_half = np.int32(np.int32(pixels[g + h] - pixels[g]) - np.int32(pixels[a + h] - pixels[a]))
         m = a + centre
         upper_half = np.int32(np.int32(pixels[m + e] - pixels[m]) - np.int32(pixels[a + e] - pixels[a]))
-        weight = disc.weights[k]
+        weight = _WEIGHTS[k]
         gx[n] = np.float32(np.int32(square - 2 * left_half)) * weight
         gy[n] = np.float32(np.int32(2 * upper_half - square)) * weight
         n += np.uint64(1)
@@ -82,7 +70,7 @@ def _sample_gradients(pixels, rows, stride, x, y, s, disc, space):
 
 
 @helper
-def _strongest_window(space, n, bins):
+def _strongest_window(space, n):
     """Direction [rad] of the largest sum of gradients within a window of 60°, moved in steps of 5°; first one wins.
 
     A window is the difference of two running sums over bins, which go on beyond the full circle by its width.
@@ -91,7 +79,7 @@ def _strongest_window(space, n, bins):
     for k in range(sums.shape[1]):  # a slice would take longer to compile
         sums[0, k] = sums[1, k] = 0.0
     for i in range(n):
-        k = bins[degrees[i]] + np.uint64(1)
+        k = _BIN[degrees[i]] + np.uint64(1)
         sums[0, k] += gx[i]
         sums[1, k] += gy[i]
     for k in range(_WINDOW):
@@ -110,20 +98,20 @@ def _strongest_window(space, n, bins):
 
 
 @kernel
-def orientations(integral, uv, size, disc):
-    """Angles (N,) [rad], y down, in 0..2π, of features with pixels (N, 2) and sizes (N,) [px]; `disc` is `DISC`.
+def orientations(integral, uv, size):
+    """Angles (N,) [rad], y down, in 0..2π, of features with pixels (N, 2) and sizes (N,) [px].
 
     They are NaN where no wavelet fits into the image; `integral` is of `integral_image`.
     """
-    out, n = np.full(len(uv), np.nan), len(disc.weights)
+    out, n = np.full(len(uv), np.nan), len(_WEIGHTS)
     space = (  # columns and rows of the samples, gradients, their angles, and sums
         np.empty(2 * RADIUS + 1, np.int64), np.empty(2 * RADIUS + 1, np.int64), np.empty(n, np.float32),
         np.empty(n, np.float32), np.empty(n, np.int32), np.empty((2, _BINS + _WINDOW + 1)),
     )  # fmt: skip
     pixels, rows, columns = integral.reshape(-1), integral.shape[0], integral.shape[1]
     for i in range(len(uv)):
-        count = _sample_gradients(pixels, rows, columns, uv[i, 0], uv[i, 1], size[i] * (1.2 / 9.0), disc, space)
+        count = _sample_gradients(pixels, rows, columns, uv[i, 0], uv[i, 1], size[i] * (1.2 / 9.0), space)
         _degrees(space[2], space[3], space[4], count)
         if count > 0:
-            out[i] = _strongest_window(space, count, disc.bins)
+            out[i] = _strongest_window(space, count)
     return out

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from frontends.surf.config import SurfConfig
 from frontends.surf.descriptor import TURNED_BOX, UPRIGHT_BOX, describe, gaussian_weights
 from frontends.surf.detector import detect_octave, layer_sizes, make_filters
-from frontends.surf.images import Picture, float_integral_image, integral_image
+from frontends.surf.images import Picture, integral_image
 from frontends.surf.keypoints import UPRIGHT_ANGLE, Keypoints
 from frontends.surf.localisation import first_of_each, localise
-from frontends.surf.orientation import DISC, orientations
+from frontends.surf.orientation import orientations
 from frontends.surf.workers import Workers
 from slam.errors import ConfigurationError, SequenceError
 
@@ -112,7 +112,7 @@ class Surf:
         if not len(keypoints):
             return keypoints
         picture = Picture.of(image)
-        integral, uv, size = float_integral_image(picture.grey), keypoints.uv, keypoints.size
+        integral, uv, size = picture.integral, keypoints.uv, keypoints.size
         (place,) = self.workers.over(len(uv), lambda a, b: (localise(integral, uv[a:b], size[a:b], _REACH),))
         rows = np.flatnonzero(np.isfinite(place[:, 0]))
         rows = rows[np.argsort(-place[rows, 3], kind="stable")]
@@ -135,7 +135,7 @@ class Surf:
     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """Angles, NaN where there is none, and descriptors of the features from `first` to before `last`."""
         uv, size, upright = keypoints.uv[first:last], keypoints.size[first:last], self.config.upright
-        angle = np.full(last - first, UPRIGHT_ANGLE) if upright else orientations(integral, uv, size, DISC)
+        angle = np.full(last - first, UPRIGHT_ANGLE) if upright else orientations(integral, uv, size)
         box = UPRIGHT_BOX if upright else TURNED_BOX
         return angle, describe(integral, uv, size, np.nan_to_num(angle), box, self._weights)
 

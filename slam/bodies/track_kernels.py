@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import column_times, invert_symmetric, multiply, row_times, square, trace, turn, turn_back
+from slam.kernels.linear import invert_symmetric, multiply, row_times, square, trace, turn
 from slam.kernels.se3 import transform, transform_back
 from slam.kernels.stereo import by_point, residual
 from slam.runtime.compilation import helper, kernel
@@ -84,7 +84,7 @@ def constant_velocities(A, p, rows, times, prior):
         invert_symmetric(M0, RIDGE * trace(M0) + LEAST, P0)
         multiply(P0, M1, G)
         for i in range(3):
-            told[i] = b1[i] - column_times(G, i, b0)
+            told[i] = b1[i] - row_times(G.T, i, b0)
             for j in range(3):
                 S[i, j] = M2[i, j] - (G[0, i] * M1[0, j] + G[1, i] * M1[1, j] + G[2, i] * M1[2, j])
             S[i, i] += prior
@@ -192,10 +192,10 @@ def windows_in_body(A, p, dof, anchor, rows, history, known):
             T, q, o = history[w], p[n, w], anchor[n]
             away = q[0] + o[0] - T[0, 3], q[1] + o[1] - T[1, 3], q[2] + o[2] - T[2, 3]
             for i in range(3):
-                points[m, w, i] = column_times(T, i, away)
+                points[m, w, i] = row_times(T.T, i, away)
             there[m, w] = known[w] and dof[n, w] > 0
             if there[m, w]:
-                turn_back(T, A[n, w], turned[m, w])
+                turn(T.T, A[n, w], turned[m, w])
             else:
                 turned[m, w] = 0.0
     return points, turned, there

@@ -10,9 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from slam.calibration.model import RigModel
-from slam.calibration.posterior import FOCALS, Evidence, along
-from slam.geometry.camera import off_middle
-from slam.geometry.se3 import Array
+from slam.calibration.posterior import FOCALS, Evidence, Prior, along
+from slam.geometry.camera import off_middle, size_doubt
 
 #: guard: Least gain of twice the log-likelihood. With unlimited data it is the square of the error in standard
 #: deviations of the prior, so this is 7 of them. Over the recordings and worlds at hand it is up to 28; with the lens
@@ -24,34 +23,26 @@ GAIN = 49.0
 FOCAL_WARNING = 16.0
 
 
-def middle_refuted(model: RigModel, mean: Array, covariance: Array, evidence: Evidence) -> bool:
-    """Whether the images are far less likely if the principal points are in their middle; see `conflict`.
-
-    `mean` (n,) is the prior's.
-    """
-    change = -mean
-    for side, camera in (("left", model.rig.left), ("right", model.rig.right)):
-        x, y = off_middle(camera) * (camera.width - 1, camera.height - 1) / 2 / (camera.fu, camera.fv)
-        change = change + x * along(model, f"{side}_cx") + y * along(model, f"{side}_cy")
-    pull, held = _of_calibration(covariance, evidence)
-    return bool(change @ held @ change - 2 * pull @ change > GAIN)
-
-
-def _of_calibration(covariance: Array, evidence: Evidence) -> tuple[Array, Array]:
-    """The likelihood of the prior's mean in information form: times the mean (n,), and the information (n, n)."""
-    information = np.linalg.inv(covariance)
-    posterior = np.linalg.inv(information + evidence.S)
-    return information @ (posterior @ evidence.e), information - information @ posterior @ information
-
-
-def conflict(model: RigModel, covariance: Array, evidence: Evidence, which: str = "", focal: float = GAIN) -> str:
+def conflict(model: RigModel, prior: Prior, evidence: Evidence | None, which: str = "", focal: float = GAIN) -> str:
     """What is wrong with a calibration, in a line; empty where no cause alone explains the images far better.
 
-    `covariance` (n, n) is that of the prior, which allows the errors that calibrations have; `evidence` is of the n
-    parameters less the prior's mean. A focal length is named from the gain `focal` on, other causes from `GAIN`.
-    `which` says which calibration it is: "kept ", or nothing.
+    Of the `prior` the widest covariance counts, which allows the errors that calibrations have. Principal points far
+    from the middle of the images are wrong unless the `evidence` makes the middle far less likely. A focal length is
+    named from the gain `focal` on, other causes from `GAIN`. `which` says which calibration it is: "kept ", or nothing.
     """
-    whose, (pull, held) = f"{which}calibration", _of_calibration(covariance, evidence)
+    whose, unlikely = f"{which}calibration", size_doubt(model.rig.left, model.rig.right)
+    if evidence is None:
+        return unlikely
+    information = prior.information[-1]
+    posterior = np.linalg.inv(information + evidence.S)
+    held = information - information @ posterior @ information  # information on the prior's mean
+    pull = information @ (posterior @ (evidence.e - evidence.S @ prior.mean))
+    middle = -prior.mean
+    for side, camera in (("left", model.rig.left), ("right", model.rig.right)):
+        x, y = off_middle(camera) * (camera.width - 1, camera.height - 1) / 2 / (camera.fu, camera.fv)
+        middle = middle + x * along(model, f"{side}_cx") + y * along(model, f"{side}_cy")
+    if unlikely and middle @ held @ middle - 2 * pull @ middle < GAIN:
+        return unlikely
 
     def freed(*directions: tuple[str, ...]) -> tuple[float, list[float]]:
         """Twice the log-likelihood that is gained with these parameters at any values, and the values."""

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from slam.calibration.config import SelfCalibrationConfig
-from slam.calibration.conflict import FOCAL_WARNING, GAIN, conflict, middle_refuted
+from slam.calibration.conflict import FOCAL_WARNING, GAIN, conflict
 from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.calibration.pairs import View, match, noise_variances, pair_evidence, pair_of, parallax
 from slam.calibration.posterior import (
@@ -40,7 +40,6 @@ from slam.calibration.saved import SavedCalibration, joint_calibration
 from slam.data import CommonError, Estimate, StereoFeatures
 from slam.errors import CalibrationError, ConfigurationError
 from slam.geometry.arrays import changed
-from slam.geometry.camera import size_doubt
 from slam.geometry.rig import StereoRig, rig_difference, rig_numbers
 from slam.geometry.se3 import Array, adjoint
 from slam.interfaces import Backend, ConsideringBackend, RevisingBackend
@@ -49,8 +48,9 @@ from slam.tracks.follow import Matches
 _BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: within a block of so many, errors are taken to be correlated
 _MOST_FEATURES = 1000  # cost: of a view, the strongest ones; half of the usual 800 made drives worse by a half
 
-#: Change of the correction, in standard deviations of the disparities' error, for a back end to revise its past.
-_SIGNIFICANT = 0.5
+#: Change of the correction, in standard deviations of the disparities' error, for a back end to revise its past: it
+#: then processes all its measurements again.
+SIGNIFICANT = 0.5
 
 #: Standard deviation of the baseline's length, as a share of it: the squares of a calibration board are known to some
 #: tenths of a percent. It scales the whole world, so images never show it.
@@ -123,15 +123,8 @@ class SelfCalibration:
 
     def _contradicted(self, focal: float) -> str:
         rows, moved = self._rows.total(), self._moved()
-        unlikely = size_doubt(self.rig.left, self.rig.right)
-        if rows is None:
-            return unlikely
-        found = rows if moved is None else rows + moved
-        found = found._replace(e=found.e - found.S @ self._prior.mean)
-        prior = self._prior.covariances[-1]
-        if unlikely and not middle_refuted(self.model, self._prior.mean, prior, found):
-            return unlikely
-        return conflict(self.model, prior, found, "kept " if self._kept else "", focal)
+        found = rows if rows is None or moved is None else rows + moved
+        return conflict(self.model, self._prior, found, "kept " if self._kept else "", focal)
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Apply the present posterior to features from now on; returns the change, or None.
@@ -316,14 +309,6 @@ class RemainingRigError:
         out[:, 2, -2] = points[:, 2]  # with a longer baseline, the nominal one's disparity is smaller
         out[:, :, -1] = -field @ (self._calibration.applied.parameters - self._revised)
         return out
-
-    def apply(self, backend: Backend) -> Revision | None:
-        """Correct features by the present posterior from now on; returns the change, or None.
-
-        For a back end that can revise, a change means processing all its measurements again, so it waits until the
-        change is significant.
-        """
-        return self._calibration.apply(_SIGNIFICANT if isinstance(backend, RevisingBackend) else 0.0)
 
     def revise(self, backend: Backend, restarted: bool) -> Revision | None:
         """Correct a back end's earlier measurements, if it can revise them; returns the change, or None.

@@ -7,16 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import (
-    assign,
-    column_times,
-    factorise,
-    invert_symmetric,
-    median,
-    row_times,
-    solve_factorised,
-    square,
-)
+from slam.kernels.linear import assign, factorise, invert_symmetric, median, row_times, solve_factorised, square
 from slam.kernels.se3 import exp
 from slam.runtime.compilation import helper, kernel
 
@@ -125,7 +116,7 @@ def fit(first, second, R, t, focal, noise, typical, steps):
         for i in range(3):
             t[i] += step[3 + i]
             for j in range(3):
-                R[i, j] = column_times(before, j, turn[i])
+                R[i, j] = row_times(before.T, j, turn[i])
         last = _correct(first, *at[1:], step, noise, points)
         if not last >= 1e-3:  # 1e-3: [px]; at 0.02 focal lengths were wrong by percents
             break
@@ -140,10 +131,10 @@ def _solve(J_motion, residual, information, weights, step):
     for p in range(len(weights)):
         for i in range(6):
             for k in range(3):
-                weighted[k] = weights[p] * column_times(information[p], k, J_motion[p, :, i])
+                weighted[k] = weights[p] * row_times(information[p].T, k, J_motion[p, :, i])
             step[i] += weighted[0] * residual[p, 0] + weighted[1] * residual[p, 1] + weighted[2] * residual[p, 2]
             for j in range(i + 1):
-                H[i, j] += column_times(J_motion[p], j, weighted)
+                H[i, j] += row_times(J_motion[p].T, j, weighted)
     for i in range(6):
         ridge += H[i, i]
     for i in range(6):
@@ -166,9 +157,9 @@ def _correct(first, J_point, J_motion, residual, information, step, noise, point
         for i in range(3):
             weighted[i] = row_times(information[p], i, rest)
         for i in range(3):
-            rest[i] = column_times(J_point[p], i, weighted)
+            rest[i] = row_times(J_point[p].T, i, weighted)
         for i in range(3):
-            points[p, i] = first[p, i] + column_times(noise, i, rest)
+            points[p, i] = first[p, i] + row_times(noise.T, i, rest)
     return last
 
 

@@ -17,6 +17,7 @@ from slam.calibration.model import RESIDUAL, RigModel
 from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array
+from slam.naming import of_shapes
 
 #: Possible scales of a rig's residual fields, see `field_variance`, equally probable a priori: from none to a pixel at
 #: 1000 px. Rows tell which it is, so the range matters only where it is too narrow.
@@ -296,10 +297,7 @@ class RigPosterior:
     names: ClassVar = RigModel.names  # of the parameters (n,)
     units: ClassVar = RigModel.units
 
-    def __repr__(self) -> str:
-        most = int(np.argmax(np.abs(self.mean) / self.sigma))
-        text = f"{self.names[most]} is {self.mean[most] / self.sigma[most]:+.1f} sigma"
-        return f"RigPosterior({len(self.names)} parameters; {text})"
+    __repr__ = of_shapes
 
     @property
     def sigma(self) -> Array:

@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import reduce
 from operator import add
 from pathlib import Path
@@ -40,12 +40,7 @@ class SavedCalibration:
 
     posterior: RigPosterior
     rig: Mapping[str, float]
-    evidence: RigEvidence | None = None
-
-    def __repr__(self) -> str:
-        r = self.rig
-        rig = f"{r['width']:.0f}x{r['height']:.0f}, focal length {r['focal']:.1f} px, baseline {r['baseline']:.4f} m"
-        return f"SavedCalibration({rig}; {self.posterior!r})"
+    evidence: RigEvidence | None = field(default=None, repr=False)
 
     def to_json(self) -> dict[str, Any]:
         """As plain types."""

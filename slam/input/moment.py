@@ -36,8 +36,8 @@ class MomentWatch:
         self._before: tuple[Array, Array] | None = None  # pose and features of the last frame, if that was measured
         self._blocks: list[Array] = []  # sums of products (2, 7, 7) [px²], late and early, see `_products`
         self._length, self._in_last = 1, 1  # frames of a block, and of the last one
-        self._whole = np.zeros((2, 7, 7))  # their sum
-        self._recent: list[Array] = []  # the same of the last frames
+        self._whole = np.zeros((2, 7, 7))  # sum of all blocks
+        self._recent: list[Array] = []  # sums of products of the last frames
         self._sudden = np.zeros(2)  # largest lag of successive frames (2,), late and early
 
     def add(self, features: StereoFeatures, T_world_left: Array, measured: bool) -> None:

@@ -61,10 +61,12 @@ class InputWarnings:
         self._last: Checksum | None = None  # of the frame before
         self._last_copy = ""  # why its right image was a copy
         self._grain_warned = False
-        unit, size = baseline_doubt(rig.baseline), size_doubt(rig.left, rig.right)
-        for unlikely in filter(None, (unit, size)):
-            self._warn(unlikely, no_path=unlikely == unit)  # the images show the other: `slam.calibration`
+        if unit := baseline_doubt(rig.baseline):
+            self._warn(unit, no_path=True)
             self._pair_warned = self._partners_explained = True  # and what follows from it is not
+        if size := size_doubt(rig.left, rig.right):
+            self._warn(size)  # whether there is a path the images show: `slam.calibration`
+            self._partners_explained = True
         if not self.lines and (odd := oblong(rig.left, rig.right)):
             self._warn(odd)
 

@@ -179,12 +179,6 @@ def row_times(M, i, v):
 
 
 @helper
-def column_times(M, i, v):
-    """Entry i of ``Mᵀ v`` for v (3,)."""
-    return M[0, i] * v[0] + M[1, i] * v[1] + M[2, i] * v[2]
-
-
-@helper
 def assign(M, out):
     """Copy a matrix: ``out[:] = M`` makes Numba compile messages about shapes, for as long as a large kernel."""
     for i in range(out.shape[0]):
@@ -216,14 +210,3 @@ def turn(R, M, out):
         x, y, z = row_times(M, 0, R[i]), row_times(M, 1, R[i]), row_times(M, 2, R[i])
         for j in range(3):
             out[i, j] = x * R[j, 0] + y * R[j, 1] + z * R[j, 2]
-
-
-@helper
-def turn_back(R, M, out):
-    """``Rᵀ M R`` (3, 3) of a symmetric M, of which all is read."""
-    for i in range(3):
-        x = M[0, 0] * R[0, i] + M[0, 1] * R[1, i] + M[0, 2] * R[2, i]
-        y = M[1, 0] * R[0, i] + M[1, 1] * R[1, i] + M[1, 2] * R[2, i]
-        z = M[2, 0] * R[0, i] + M[2, 1] * R[1, i] + M[2, 2] * R[2, i]
-        for j in range(3):
-            out[i, j] = x * R[0, j] + y * R[1, j] + z * R[2, j]

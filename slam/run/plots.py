@@ -26,6 +26,7 @@ from slam.outputs import Output, require_outputs
 from slam.run.results import facts, number
 from slam.run.run_data import RunData, place_of_truth, pose_errors, well_known
 from slam.run.schema import STAGE_NAMES, body_colour
+from slam.runtime.memory import give_back_freed_memory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -85,6 +86,7 @@ def plot_folders(folders: Sequence[Path], out: Path | None, kind: str, overwrite
 
 def leave_picture(folder: Path) -> None:
     """The picture of a run that has just ended; where there is nothing to draw a warning says so."""
+    give_back_freed_memory()
     try:
         plot(_read([folder]), folder / PICTURE)
     except SlamError as error:

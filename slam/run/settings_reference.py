@@ -40,7 +40,7 @@ def settings() -> Iterator[Setting]:
     configs = {kind: SystemConfig.for_kind(kind) for kind in KINDS}
     for key, _ in leaves(configs[_FIRST].to_json()):
         *path, name = key.split(".")
-        if path[0] not in _PARTS and can_be_set(key):
+        if key.partition(".")[0] not in _PARTS and can_be_set(key):
             parts = {kind: reduce(getattr, path, config) for kind, config in configs.items()}
             defaults = {kind: getattr(part, name) for kind, part in parts.items()}
             yield Setting(key, "", defaults, documented(type(parts[_FIRST])).get(name, ""))

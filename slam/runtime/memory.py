@@ -12,20 +12,31 @@ import os
 import sys
 from functools import cache
 
-_TRIM, _MMAP = -1, -3  # glibc's numbers of these parameters
+_TRIM, _MMAP, _ARENAS = -1, -3, -8  # glibc's numbers of these parameters
 _KEPT = 2**27  # bytes at the end of the heap that may be free
 _LARGE = 2**25  # bytes of an array from which it gets pages of its own: the most that glibc takes
-_VARIABLES = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
+_HEAPS = 2  # one for each thread would keep what that thread alone has freed
+_VARIABLES = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "MALLOC_ARENA_MAX", "GLIBC_TUNABLES")
 
 
 @cache
-def keep_freed_memory() -> bool:
-    """Have the process keep up to 128 MB that were freed; says whether that could be set.
+def keep_freed_memory() -> None:
+    """Have the process keep up to 128 MB that were freed, in two heaps.
 
-    It cannot where the C library is another than glibc. Where one of glibc's environment variables for it is set, that
-    is left as it is.
+    Nothing is changed where the C library is another than glibc, or one of its environment variables for that is set.
     """
-    if sys.platform != "linux" or any(name in os.environ for name in _VARIABLES):
-        return False
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    return mallopt is not None and bool(mallopt(_TRIM, _KEPT)) and bool(mallopt(_MMAP, _LARGE))
+    if not any(name in os.environ for name in _VARIABLES):
+        for parameter, value in ((_TRIM, _KEPT), (_MMAP, _LARGE), (_ARENAS, _HEAPS)):
+            _call("mallopt", parameter, value)
+
+
+def give_back_freed_memory() -> None:
+    """Give the system what is free, before something else than frames needs memory."""
+    _call("malloc_trim", 0)
+
+
+def _call(name: str, *numbers: int) -> None:
+    """Call a function of glibc, where that is the C library."""
+    function = getattr(ctypes.CDLL(None), name, None) if sys.platform == "linux" else None
+    if function is not None:
+        function(*numbers)

@@ -200,5 +200,7 @@ def _hint(address: str) -> str:
     if address.isdecimal():
         there = sorted(str(path) for path in Path("/dev").glob("video*"))
         return f": there are {', '.join(there)}" if there else ": this machine shows no camera (/dev/video*)"
-    known = "!" not in address or cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER)
-    return "" if known else ": this OpenCV was built without GStreamer"
+    if "!" in address:
+        known = cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER)
+        return "" if known else ": this OpenCV was built without GStreamer"
+    return "" if "://" in address or Path(address).exists() else ": there is no such file or device"

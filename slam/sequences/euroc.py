@@ -10,11 +10,11 @@ from slam.errors import CalibrationError, SequenceError, TrajectoryError
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.base import FaultLog, RecordedSequence
 from slam.sequences.calibration import naming, read_entries
-from slam.sequences.names import MOST_NANOSECONDS, stem
+from slam.sequences.names import stem
 from slam.sequences.options import Options
 from slam.sequences.pairs import Listing, image_names, in_order, listed, open_images, told_times
 from slam.sequences.rigs import EUROC, body_pose, calibration_files, files_in, first_complete, read_rig
-from slam.sequences.tables import read_rows, require_truth
+from slam.sequences.tables import MOST_NANOSECONDS, read_rows, require_truth
 
 #: The motion capture of EuRoC's rooms is good to a millimetre (Burri et al., 2016). Its markers on the vehicle are some
 #: half a metre apart, which makes 2 mrad. The camera's orientation in the vehicle is calibrated to half a degree or so,

@@ -77,7 +77,14 @@ def _sides(folder: Path, options: Options) -> list[Side]:
         return sides
     if folder.is_file():
         return [(folder, None)]
-    return [_found(folder / expanded(options["left"]) if "left" in options else folder)]
+    if "left" in options:
+        return [_found(folder / expanded(options["left"]))]
+    if any(path.suffix.lower() in IMAGE_SUFFIXES for path in _inside(folder)):
+        return [_found(folder)]
+    places = [path for path in _inside(folder) if _is_place(path)]
+    if len(places) != 1:
+        raise SequenceError(f"{folder}: {len(places)} folders and videos, where layout=sbs needs one: add left=…")
+    return [_found(places[0])]
 
 
 def _found(path: Path) -> Side:

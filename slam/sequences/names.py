@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
@@ -13,9 +12,7 @@ from statistics import median
 import numpy as np
 
 from slam.geometry.stamps import IntArray
-
-#: Latest time [ns]: in the year 2262, where 64 bits end.
-MOST_NANOSECONDS = 2**63 - 1
+from slam.sequences.tables import MOST_NANOSECONDS
 
 #: Words for the left and the right camera, in names of folders, videos, images and topics.
 SIDES = (
@@ -38,10 +35,10 @@ _STAMP = re.compile(
 _SECONDS = re.compile(r"-?\d{1,10}[.,]\d{1,9}", re.ASCII)  # a whole name
 _DECIMALS = {19: 0, 18: 0, 16: 3, 13: 6}  # from a stamp's unit to nanoseconds, by its digits; of seconds there are nine
 _DATE = re.compile(r"(?<!\d)20\d\d[-_.]?[01]\d[-_.]?[0-3]\d(?!\d)", re.ASCII)  # what follows is a time of day
-#: A date and time, down to milli-, micro- or nanoseconds; behind a point down to any digit.
-MOMENT = re.compile(
+# A date and time, down to milli-, micro- or nanoseconds.
+_MOMENT = re.compile(
     r"(?<!\d)(20\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[-_T ]?([0-2]\d)[-_:.h]?([0-5]\d)[-_:.m]?([0-5]\d)"
-    r"(?:(?:\.|[-_s]?(?=(?:\d{3}){1,3}(?!\d)))(\d{1,9}))?(?![.,]?\d)",
+    r"(?:[-_.s]?(\d{9}|\d{6}|\d{3}))?(?![.,]?\d)",
     re.ASCII,
 )
 _NUMBER = re.compile(r"\d+", re.ASCII)
@@ -135,20 +132,18 @@ def _stamps(names: Sequence[str]) -> IntArray | None:
 
 def _moments(names: Sequence[str]) -> IntArray | None:
     """Dates and times [ns since 1970] that every name has and that tell the names apart."""
-    for found in zip(*(MOMENT.finditer(name) for name in names)):  # the session's may stand before the image's
+    for found in zip(*(_MOMENT.finditer(name) for name in names)):  # the session's may stand before the image's
         if not all(match[7] for match in found) and len({match.groups()[:5] for match in found}) == 1:
             continue  # whole seconds, or a count: within a minute they are in one order
-        with suppress(ValueError):
-            keys = [since_1970(match) for match in found]
-            if len(set(keys)) == len(names) and median(_steps(keys) or [np.inf]) > _SHORTEST:  # else they count
-                return np.array(keys, np.int64)
+        whole = ["{}-{}-{}T{}:{}:{}".format(*match.groups()) for match in found]
+        try:
+            keys = np.array(whole, "datetime64[ns]").astype(np.int64)
+        except ValueError:  # no date
+            continue
+        keys += np.array([int((match[7] or "0").ljust(9, "0")) for match in found], np.int64)
+        if len(set(keys)) == len(names) and median(_steps(keys.tolist()) or [np.inf]) > _SHORTEST:  # else they count
+            return np.asarray(keys)
     return None
-
-
-def since_1970(moment: re.Match[str]) -> int:
-    """Nanoseconds since 1970 of a `MOMENT`; ValueError where there is no such date."""
-    whole = np.datetime64("{}-{}-{}T{}:{}:{}".format(*moment.groups()), "ns")
-    return int(whole.astype(np.int64)) + int((moment[7] or "0").ljust(9, "0"))
 
 
 def _split(text: str) -> tuple[str, str]:
@@ -166,9 +161,12 @@ def _nanoseconds(text: str, width: int) -> int:
 
 
 def _numbers(sides: Sequence[Sequence[str]]) -> Keys | None:
-    told = [[c for c in _columns(names) if len(set(c)) == len(c) and max(c) <= MOST_NANOSECONDS] for names in sides]
-    if not all(told):
+    tables = [_columns(names) for names in sides]
+    if not all(tables):
         return None
+    told = [[c for c in table if len(set(c)) == len(c) and max(c) <= MOST_NANOSECONDS] for table in tables]
+    if not all(told):  # only several numbers together tell the names apart
+        return _ranks([list(zip(*table)) for table in tables])
     best, chosen = (-1, 0), [columns[-1] for columns in told]
     for column in told[0]:
         others = [max(columns, key=lambda c, column=column: len(set(c) & set(column))) for columns in told[1:]]  # type: ignore[misc]
@@ -202,6 +200,15 @@ def _columns(names: Sequence[str]) -> list[tuple[int, ...]]:
     rows = [[int(digits) for digits in _NUMBER.findall(stem(name))] for name in names]
     columns = list(zip(*rows)) if len({len(row) for row in rows}) == 1 else []
     return columns if len(names) == 1 else [c for c in columns if len(set(c)) > 1]
+
+
+def _ranks(rows: Sequence[Sequence[tuple[int, ...]]]) -> Keys | None:
+    """Places of names in the order of all their numbers."""
+    if any(len(set(own)) < len(own) for own in rows) or not set(rows[0]).intersection(*rows[1:]):
+        return None
+    rank = {row: number for number, row in enumerate(sorted(set().union(*rows)))}
+    guess = "no single number in the names tells the images apart; frames are counted in the order of all of them"
+    return Keys([np.array([rank[row] for row in own], np.int64) for own in rows], False, guess)
 
 
 def _steps(numbers: Sequence[int]) -> list[int]:

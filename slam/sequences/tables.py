@@ -16,9 +16,11 @@ from slam.files import read_text
 from slam.geometry.se3 import Array, is_rotation
 from slam.geometry.trajectory import Trajectory
 from slam.sequences.base import FaultLog
-from slam.sequences.names import MOMENT, since_1970
 
 T = TypeVar("T")
+
+#: Latest time [ns]: in the year 2262, where 64 bits end.
+MOST_NANOSECONDS = 2**63 - 1
 
 #: Largest coordinate of a true path [m]: the Earth's circumference.
 LARGEST = 4.1e7
@@ -28,6 +30,7 @@ _MOST_SECONDS = 1e11  # of a time, either side of zero: in nanoseconds it would 
 _SLOWEST, _USUAL = 10.0, 0.05  # [s] between frames: at most, else they are in another unit; by which it is found
 _HEADING = re.compile(r"\D*(time|stamp|\bt\b|\bsec|\b[num]s\b)\D*", re.IGNORECASE)  # a first row that names the columns
 _IMAGE = re.compile(r"\.(png|jpe?g|p[gp]m|bmp|tiff?|webp)$", re.IGNORECASE)
+_DATE_TIME = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", re.ASCII)
 
 
 def read_rows(path: Path, parse: Callable[[str], T], faults: FaultLog) -> list[T | None]:
@@ -79,8 +82,8 @@ def read_times(path: Path, faults: FaultLog) -> Times:
         faults.report("times", f"{path}: the first number of each row counts rows; the second one is taken as time")
         times = second
     told = times[np.isfinite(times)]
-    absolute = len(told) > 0 and SINCE_1970[0] <= told[0] <= SINCE_1970[1]  # seconds, however far apart
-    if not absolute and (step := np.median([0.0, *np.abs(np.diff(told))])) > _SLOWEST:  # as a camera's in that unit
+    since_1970 = len(told) > 0 and SINCE_1970[0] <= told[0] <= SINCE_1970[1]  # seconds, however far apart
+    if not since_1970 and (step := np.median([0.0, *np.abs(np.diff(told))])) > _SLOWEST:  # as a camera's in that unit
         unit, size = min(UNITS, key=lambda one: abs(np.log(step / one[1] / _USUAL)))
         faults.report("times", f"{path}: the times are taken as {unit}")
         times = times / size
@@ -91,8 +94,8 @@ def read_times(path: Path, faults: FaultLog) -> Times:
 
 def _numbers_in(text: str) -> list[float]:
     """The numbers of a row, of which the first is finite; of one that begins with a date its time [s since 1970]."""
-    if date := MOMENT.match(text):
-        return [1e-9 * since_1970(date)]
+    if date := _DATE_TIME.match(text):
+        return [1e-9 * date_time(date[0])]
     found: list[float] = []
     for word in re.split(r"[,;\s]+", text):
         with suppress(ValueError):
@@ -105,8 +108,8 @@ def _numbers_in(text: str) -> list[float]:
 def date_time(text: str) -> int:
     """Nanoseconds since 1970 of ``2011-09-26 13:10:51.174740992``."""
     with suppress(ValueError):  # of the 31st of February
-        if date := MOMENT.fullmatch(text):
-            return since_1970(date)
+        if _DATE_TIME.fullmatch(text):
+            return int(np.datetime64(text.replace(" ", "T"), "ns").astype(np.int64))
     raise ValueError(f"{text!r:.40} is not a date and time")
 
 

@@ -13,6 +13,7 @@ from backends.iekf import IekfBackend
 from backends.iekf.filter import InvariantCamera
 from backends.window import WindowBackend
 from experiments.corridor import run as corridor
+from slam.data import Observations
 from slam.errors import ConfigurationError
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel, SlideModel, models_for
@@ -167,6 +168,44 @@ def test_pixels_that_are_mended_do_not_measure_the_world(make):
             backend.revise(lambda z, by=0.3 * (-1) ** k: z + np.array([0, 0, by]))
         step(backend, 0.1 * k, observe(T, points, 0.3, rng), known)
     assert (np.sqrt(np.diag(backend.estimate(False).covariance))[:3] > 0.99 * sigma).all()
+
+
+@pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])
+def test_landmarks_that_come_back_after_a_revision_do_not_move_the_camera(make):
+    """The pixels are mended while it looks elsewhere: NEES was 150 when the first landmarks were seen again."""
+    turns, found = np.concatenate([np.linspace(0, 1.4, 15), np.linspace(1.4, 0, 15)]), []
+    poses = np.array([se3.pose(se3.so3_exp(np.array([0, a, 0])), np.zeros(3)) for a in turns])
+    for seed in range(4):
+        rng, known = np.random.default_rng(seed), set()
+        points = rng.permutation(np.concatenate([cloud(poses[[k]], 40, rng, 5, 12) for k in (0, 7, 14)]))
+        backend = make(RIG, EstimatorModels(MotionModel(0.3, 0.5), pixel_sigma=0.3))
+        for k, T in enumerate(poses):
+            seen = observe(T, points, 0.3, rng, 60)
+            if k == 15:
+                backend.revise(lambda z: z + np.array([0, 0, 1.0]))
+            seen = Observations(seen.ids, seen.uv_left, seen.uv_right - np.array([1.0 if k < 15 else 0.0, 0]))
+            step(backend, 0.1 * k, seen, known)
+            found += [nees(backend, T)] if k > 20 else []
+    assert np.mean(found) < 20
+
+
+def test_features_slide_to_where_the_camera_is_seen_to_be():
+    """At the first step of a drive it is predicted where it was; without a slide NEES was 22 there."""
+    poses, found, models = path(2, 0.1, 10 * FORWARD, np.zeros(3)), [], models_for("driving")
+    for seed in range(20):
+        rng, backend = np.random.default_rng(seed), EkfBackend(RIG, models)
+        points = cloud(poses[1:], 60, rng, 4.0, 30.0)
+        known: set[int] = set()
+        step(backend, 0.0, observe(poses[0], points, 0.28, rng, 60), known)
+        seen = observe(poses[1], points, 0.28, rng, 60)
+        rays = [(points - T[:3, 3]) / np.linalg.norm(points - T[:3, 3], axis=1)[:, None] for T in poses]
+        angle = np.arccos((rays[0] * rays[1]).sum(axis=1).clip(-1, 1))[seen.ids]
+        by = models.slide.density * np.sqrt(angle)[:, None] * rng.standard_normal((len(seen), 2))
+        seen = Observations(seen.ids, seen.uv_left + by, seen.uv_right + by).select(np.isin(seen.ids, list(known)))
+        backend.predict(0.1)
+        backend.update(seen, poses[1])
+        found.append(nees(backend, poses[1]))
+    assert np.mean(found) < chi2.ppf(0.9999, 120) / 20
 
 
 @pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])

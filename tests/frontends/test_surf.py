@@ -60,8 +60,8 @@ def test_16_bit_images_are_on_the_scale_of_8_bit_ones(plain, kind):
 
 
 def test_sums_beyond_32_bits_wrap_around_harmlessly():
-    bright = np.full((600, 600), 60000, np.uint16)
-    bright[180:420, 140:460] = IMAGE[:240, :320].astype(np.uint16) + 59000
+    bright = np.full((360, 2700), 60000, np.uint16)  # sums of the rows of one filter wrap around, too
+    bright[60:300, 2340:2660] = IMAGE[:240, :320].astype(np.uint16) + 59000
     assert int(bright.sum(dtype=np.int64)) > 2**32
     dim = bright - np.uint16(59000)
     for upright in (True, False):
@@ -70,6 +70,9 @@ def test_sums_beyond_32_bits_wrap_around_harmlessly():
         assert len(a[0]) == len(b[0]) > 100
         # Cell sums are single-precision: a pedestal 200 times the contrast costs as much of their 24 bits.
         np.testing.assert_allclose(a[1], b[1], atol=5e-3)
+    a, b = (Surf(0.01).localise(image, b[0]) for image in (bright, dim))
+    assert len(a) == len(b) > 100
+    np.testing.assert_allclose(a.uv, b.uv, atol=1e-6)
 
 
 @pytest.mark.parametrize("octaves", [1, 2, 4])

@@ -25,12 +25,14 @@ def test_settings_reach_their_place():
         [
             "map.max_landmarks=301",
             "backend.measurement=left",
+            "frontend.threads=1",
             "association.d_match=[0.3, 0.2]",
             "models.motion.acceleration=2",
         ]
     )
     assert config.map.max_landmarks == 301
     assert config.backend == {"measurement": "left"}
+    assert config.frontend == SystemConfig.for_kind("driving").frontend | {"threads": 1}
     assert config.association.d_match == (0.3, 0.2)
     assert config.models.motion.acceleration == 2.0
     assert SystemConfig.for_kind("driving").map.max_landmarks != 301
@@ -71,6 +73,21 @@ def test_unknown_kind_and_unknown_key_in_a_file():
         SystemConfig.from_json(tree)
     with pytest.raises(ConfigurationError, match=r".motion. is a section"):
         SystemConfig.from_json({"models": {"motion": None}})
+
+
+def test_a_configuration_comes_back_from_its_json_with_options_of_any_shape():
+    own = {
+        "backend.opt": {"a": {"b": 1}},
+        "backend.none": {},
+        "map.grid": [4, 3],
+        "models.T_world_left": np.eye(4).tolist(),
+    }
+    for config in (SystemConfig(), SystemConfig.for_kind("driving").with_settings(own)):
+        assert SystemConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
+    assert config.backend == {"opt": {"a": {"b": 1}}, "none": {}}
+    for tree in ({"a": {}}, {"map": {"max_landmarks": {}}}):
+        with pytest.raises(ConfigurationError, match=r"'a'|max_landmarks must be a whole number"):
+            SystemConfig.from_json(tree)
 
 
 def test_a_whole_number_in_place_of_a_fraction_is_the_same_setting():

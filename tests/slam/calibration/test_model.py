@@ -110,7 +110,8 @@ def test_motion_in_disparity_space_is_the_rigid_one():
         np.testing.assert_allclose(J_motion[i], numeric, rtol=1e-5, atol=1e-4)
 
 
-def test_a_pair_without_noise_gives_the_truth():
+@pytest.mark.parametrize("wrong", [0, 20])
+def test_a_pair_without_noise_gives_the_truth_also_where_some_matches_are_wrong(wrong):
     rng = np.random.default_rng(0)
     theta = parameters(right_cx=4e-4, yaw=-2e-3, left_k1=-3e-3, right_k1=-2e-3)
     R, t = se3.so3_exp(np.array([0.03, -0.1, 0.02])), np.array([0.5, 0.2, -3.0])
@@ -118,6 +119,7 @@ def test_a_pair_without_noise_gives_the_truth():
     pair = [ideal, move(ideal, R, t, F)[0]]
     measured = [x - MODEL.field(x)[:, :3] @ theta for x in pair]
     corrected = [x + MODEL.shift(x, theta)[:, :3] for x in measured]
+    corrected[1][:wrong] += rng.normal(0, 10, (wrong, 3))
     evidence = pair_evidence(MODEL, Pair(*corrected, R, t), theta, NOISE)
     strong = 1e8
     mean = np.linalg.solve(prior_information(MODEL) + strong * evidence.S, strong * evidence.e)

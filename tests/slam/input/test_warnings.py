@@ -228,8 +228,9 @@ def test_what_looks_wrong_is_said_once(case):
 
 
 def test_cameras_that_are_exchanged_for_certain_are_refused():
-    with pytest.raises(SequenceError, match=r"left and right look swapped: .* exchange them"):
-        lines(every(8, swap), stereo=3)
+    for rig in (RIG, of_size(1.2)):  # also where a principal point is far from the middle
+        with pytest.raises(SequenceError, match=r"left and right look swapped: .* exchange them"):
+            lines(every(8, swap), stereo=3, rig=rig)
     assert len(lines([*stamped([0.0, 0.1]), *every(8, swap)[3:]], stereo=3)) <= 1  # they were right before
 
 

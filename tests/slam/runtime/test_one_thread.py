@@ -17,25 +17,6 @@ SEQUENCE = slam.open_sequence(WORLD)
 FRAMES = 14
 
 
-class Waiting:
-    """A back end whose `predict` waits to be let go."""
-
-    def __init__(self, part):
-        self.part = part
-        self.entered, self.go = threading.Event(), threading.Event()
-
-    def __getattr__(self, name):
-        return getattr(self.part, name)
-
-    def _wait(self):
-        self.entered.set()
-        assert self.go.wait(60)
-
-    def predict(self, stamp):
-        self._wait()
-        return self.part.predict(stamp)
-
-
 def run(backend: str) -> str:
     system = StereoSlam(SEQUENCE.rig, None, backend)
     for k in range(FRAMES):
@@ -71,13 +52,20 @@ def test_two_systems_in_two_threads_give_the_same_bytes_as_alone(names):
 
 
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])
-def test_one_system_used_from_two_threads_says_so_and_goes_on(backend):
+def test_one_system_used_from_two_threads_says_so_and_goes_on(backend, monkeypatch):
     system = StereoSlam(SEQUENCE.rig, None, backend)
     system.process_features(SEQUENCE.observations(FIRST))
-    system.backend = slow = Waiting(system.backend)
+    entered, go, predict = threading.Event(), threading.Event(), system.backend.predict
+
+    def waiting(stamp):
+        entered.set()
+        assert go.wait(60)
+        return predict(stamp)
+
+    monkeypatch.setattr(system.backend, "predict", waiting)
     thread = threading.Thread(target=lambda: system.process_features(SEQUENCE.observations(FIRST + 1)))
     thread.start()
-    assert slow.entered.wait(60)
+    assert entered.wait(60)
     calls = [
         lambda: system.process_features(SEQUENCE.observations(FIRST + 2)), system.estimate, system.snapshot,
         system.trajectory, lambda: pickle.dumps(system),
@@ -85,9 +73,9 @@ def test_one_system_used_from_two_threads_says_so_and_goes_on(backend):
     for call in calls:
         with pytest.raises(SlamError, match=r"^this system is in use by another thread"):
             call()
-    slow.go.set()
+    go.set()
     thread.join()
-    system.backend = slow.part
+    monkeypatch.undo()
     for k in range(2, FRAMES):
         system.process_features(SEQUENCE.observations(FIRST + k))
     assert state(system) == alone(backend)

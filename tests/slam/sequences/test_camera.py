@@ -107,6 +107,11 @@ def test_a_camera_that_stays_silent_ends_the_run_with_one_line(rig_here, played)
         next(frames)
 
 
+def test_a_device_that_is_not_there_is_said_to_be_missing():
+    with pytest.raises(SequenceError, match=r"camera:none\.mp4: cannot be opened: there is no such file or device"):
+        slam.open_sequence("camera:none.mp4")
+
+
 IMAGE = np.zeros((4, 4), np.uint8)
 
 

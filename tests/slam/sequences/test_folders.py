@@ -74,13 +74,16 @@ def test_names_are_read_as_numbers_and_stamps(two_folders: Path, name: str) -> N
         ("", "{i} {ns}", 1.7e9, 0.1),
         ("frame;t\n", "{n};{s:.6f}", 1.7e9, 0.1),
         ("", "2023-11-14 22:13:2{i}.500000", 1.7e9 + 0.5, 1.0),
+        ("", "1999-11-14 22:13:2{i}.5", 942617600.0 + 0.5, 1.0),
+        ("", "{ns_boot}", 20011.228, 0.1),  # no date
         ("", "{i:03d}.png {s:.6f}", 1.7e9, 0.1),
     ],
 )
 def test_times_as_other_programs_write_them(two_folders: Path, heading, row, first, step) -> None:
     """A heading is no row, which would shift all times by one; nanoseconds are no seconds."""
-    ns = [{"ns0": i * 10**8, "ns": 17 * 10**17 + i * 10**8, "slow": 1_700_000_000 + 20 * i} for i in range(6)]
-    rows = [row.format(i=i, n=i + 100, s=1.7e9 + 0.1 * i, **ns[i]) + "\n" for i in range(6)]
+    starts = {"ns0": 0, "ns": 17 * 10**17, "ns_boot": 20_011_228_000_000}
+    ns = [{name: start + i * 10**8 for name, start in starts.items()} for i in range(6)]
+    rows = [row.format(i=i, n=i + 100, s=1.7e9 + 0.1 * i, slow=17 * 10**8 + 20 * i, **ns[i]) + "\n" for i in range(6)]
     (two_folders / "times.txt").write_text(heading + "".join(rows))
     sequence = open_sequence(two_folders)
     assert np.allclose(sequence.stamps, first + step * np.arange(6), rtol=0, atol=1e-5) and len(sequence) == 6
@@ -98,6 +101,18 @@ def test_rows_of_times_belong_to_the_images_that_they_name_or_number(two_folders
     sequence = open_sequence(two_folders)
     assert np.allclose(sequence.stamps, 7 + 0.3 * np.array([0, 1, 3, 4, 5]))
     assert [left for left, _ in seeds(sequence)] == [0, 1, 3, 4, 5]
+
+
+@pytest.mark.parametrize("lost", [(), ("right",), ("left", "right")])
+def test_names_that_only_several_numbers_tell_apart_pair_the_same_ones(two_folders: Path, lost) -> None:
+    for side in ("left", "right"):
+        rename(two_folders / side, lambda i: f"s{1 + i // 3}_f{i % 3}.png")
+    for side in lost:
+        (two_folders / side / ("s1_f2.png" if side == "right" else "s2_f0.png")).unlink()
+    found = [(a, b) for a, b in seeds(open_sequence(two_folders)) if b is not None]
+    assert found == [
+        (i, i + 10) for i in range(6) if not (i == 2 and "right" in lost) and not (i == 3 and "left" in lost)
+    ]
 
 
 def test_one_camera_twice_is_refused(two_folders: Path, videos: Path) -> None:
@@ -185,6 +200,13 @@ def test_images_and_videos_side_by_side(two_folders: Path, tmp_path: Path) -> No
     assert seeds(open_sequence(f"{folder}?layout=sbs&swap=yes")) == [(b, a) for a, b in PAIRS]
     recordings.write_image(folder / "3.png", 3, 131)
     assert [f.index for f in open_sequence(f"{folder}?layout=sbs")] == [0, 1, 2, 4, 5]
+    outer = tmp_path / "outer"
+    outer.mkdir()
+    film.rename(outer / film.name)
+    assert seeds(open_sequence(f"{outer}?layout=sbs&calibration=../calibration.yaml")) == PAIRS
+    folder.rename(outer / "images")
+    with pytest.raises(SequenceError, match="2 folders and videos, where layout=sbs needs one: add left="):
+        open_sequence(f"{outer}?layout=sbs")
 
 
 @pytest.mark.parametrize("clockwise", [1, -1])

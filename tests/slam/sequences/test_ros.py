@@ -56,19 +56,20 @@ def test_a_single_wrong_stamp_costs_its_frame(tmp_path: Path) -> None:
     assert [left for left, _ in seeds(slam.open_sequence(write(tmp_path / "a.bag", rows)))] == [0, 1, 2, 4, 5, 6, 7]
 
 
-@pytest.mark.parametrize(
-    "kind",
-    ["ros1", "mcap", "db3", "packed folder", "packed mcap", "single folder"],
-)
+@pytest.mark.parametrize("kind", ["ros1", "mcap", "db3", "packed folder", "packed mcap", "single folder", "images"])
 def test_every_kind_of_recording_is_found_out_and_read(kind: str, tmp_path: Path) -> None:
     version = 1 if kind == "ros1" else 2
     packed = {"packed": "FILE", "single": "MESSAGE"}.get(kind.split()[0], "")
     name = "walk.bag" if version == 1 else "walk.mcap" if kind.endswith("mcap") else "walk"
-    path = write(tmp_path / name, stereo(STORES[version]), version, packed)
+    rows, store = stereo(STORES[version]), STORES[version]
+    if kind == "images":
+        small = [(f"{topic}/compressed", COMPRESSED, at, compressed(store, m)) for topic, k, at, m in rows if k == RAW]
+        rows = [*small, *(row for row in rows if row[1] != RAW)]
+    path = write(tmp_path / name, rows, version, packed)
     if kind.endswith(("mcap", "db3")):
         (path,) = path.glob(f"*.{kind.split()[-1]}*")
-    sequence = slam.open_sequence(path)
-    assert (sequence.format, sequence.kind, len(sequence)) == ("ros", "handheld", 6)
+    sequence = slam.open_sequence(f"{path}?kind=driving")
+    assert (sequence.format, sequence.kind, len(sequence)) == ("ros", "driving", 6)
     assert seeds(sequence) == [(k, k + 10) for k in range(6)]
     assert [(f.index, *seeds([f])[0]) for f in sequence.frames(4)] == [(4, 4, 14), (5, 5, 15)]
     assert np.allclose(np.diff([f.stamp for f in sequence]), 0.05)
@@ -126,19 +127,6 @@ def test_encodings(encoding: str, pixels: np.ndarray, grey: int, dtype: type) ->
     if dtype == np.uint16:
         swapped = grey_image(image(STORES[2], T0, pixels.byteswap(), encoding, True), RAW, "/x")
         assert np.array_equal(swapped, found)
-
-
-def test_compressed_images(tmp_path: Path) -> None:
-    store = STORES[2]
-    rows = [
-        (f"{topic}/compressed", COMPRESSED, time, compressed(store, time, message))
-        if kind == RAW
-        else (topic, kind, time, message)
-        for topic, kind, time, message in stereo(store)
-    ]
-    sequence = slam.open_sequence(f"{write(tmp_path / 'small', rows, 2)}?kind=driving")
-    assert sequence.kind == "driving"
-    assert seeds(sequence) == [(k, k + 10) for k in range(6)]
 
 
 def test_an_image_of_another_size_costs_its_frame_alone(tmp_path: Path) -> None:
