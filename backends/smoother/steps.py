@@ -89,7 +89,7 @@ class Steps(RectifiedMeasurement):
             s = replace(s, contradicted=found.contradicted)
             # where the turn is unknown, few are linearised where it is not; of `seen` poses more is known than that
             turned = self.config.poses == "every" and unknown_turn(s.relative)
-            if turned and found.used.sum() < MIN_CONSENSUS or not found.used.any():
+            if (turned and found.used.sum() < MIN_CONSENSUS) or not found.used.any():
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", ids.copy())
             after, nis, why = self._corrected(s, graph, one, found, rows, z)
         except (np.linalg.LinAlgError, SolverError) as error:
