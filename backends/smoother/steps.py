@@ -81,14 +81,15 @@ class Steps(RectifiedMeasurement):
         try:
             one = self._problem(s, rows, z)
             at, start = s.of(s.anchor), one.predicted if guess is None else guess
-            turned = _attitude(s.poses[at], s.spread[at]) - _attitude(s.start, s.prior)  # since the problem began
-            lost = len(s.sights[at]) >= MIN_CONSENSUS and unknown_turn(turned)
+            since = _attitude(s.poses[at], s.spread[at]) - _attitude(s.start, s.prior)  # since the problem began
+            lost = len(s.sights[at]) >= MIN_CONSENSUS and unknown_turn(since)
             found = agreement(
                 one, start, lambda: landmarks_pose(self, one.points, z, one.predicted, s.number), s.contradicted, lost
             )
             s = replace(s, contradicted=found.contradicted)
-            few = found.used.sum() < MIN_CONSENSUS and unknown_turn(s.relative)  # linearised where it may not be
-            if few or not found.used.any():
+            # where the turn is unknown, few are linearised where it is not; of `seen` poses more is known than that
+            turned = self.config.poses == "every" and unknown_turn(s.relative)
+            if (turned and found.used.sum() < MIN_CONSENSUS) or not found.used.any():
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", ids.copy())
             after, nis, why = self._corrected(s, graph, one, found, rows, z)
         except (np.linalg.LinAlgError, SolverError) as error:
