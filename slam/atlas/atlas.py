@@ -115,7 +115,7 @@ class Atlas:
 
     def with_new(self, keyframe: Keyframe) -> Atlas:
         """A copy with one more keyframe."""
-        index = self.index.with_new(keyframe.descriptors.astype(np.float32))
+        index = self.index.with_new(keyframe.descriptors)
         return replace(self, keyframes=(*self.keyframes, keyframe), index=index)
 
     @cached_property

@@ -15,8 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2, vq
 
-from slam.geometry.arrays import narrowed
-
 Vectors = NDArray[np.float32]
 
 _LENGTH = 1024  # cost: of a keyframe's vector: 4 kB
@@ -31,22 +29,21 @@ class PlaceIndex:
     """VLAD vectors of keyframes, and the visual words they are made with."""
 
     words: Vectors | None = None  # (W, D); None before they have been learnt
-    # descriptors (F, D) of the keyframes so far, kept as long as words are still to be learnt
-    early: tuple[NDArray[np.float16], ...] = ()
+    early: tuple[NDArray[np.float16], ...] = ()  # descriptors (F, D) of the keyframes, while words are to be learnt
     count: int = 0  # number of keyframes
     vectors: Vectors | None = None  # of the keyframes (count, W · D); None without words
 
-    def with_new(self, descriptors: Vectors) -> PlaceIndex:
+    def with_new(self, descriptors: NDArray[np.float16]) -> PlaceIndex:
         """A copy with one more keyframe, which has descriptors (F, D)."""
         count = self.count + 1
-        early = (*self.early, narrowed(descriptors, np.float16)) if count <= _LEARN_AT[-1] else ()
+        early = (*self.early, descriptors) if count <= _LEARN_AT[-1] else ()
         if count not in _LEARN_AT:
             return replace(self._appended(descriptors), early=early)
         every = np.concatenate(early).astype(np.float32)
         number = min(max(_LENGTH // max(every.shape[1], 1), 1), len(every))
         index = PlaceIndex(words=learn_words(every, number) if number else None)
         for some in early:
-            index = index._appended(some.astype(np.float32))
+            index = index._appended(some)
         return replace(index, early=early if count < _LEARN_AT[-1] else ())
 
     def similarity(self, descriptors: Vectors) -> NDArray[np.float32]:
@@ -60,11 +57,11 @@ class PlaceIndex:
         lengths = np.sqrt(np.maximum(squares, 0)) * np.linalg.norm(wanted)
         return np.asarray((products[:, 0] - mean @ wanted) / np.maximum(lengths, _NONE), np.float32)
 
-    def _appended(self, descriptors: Vectors) -> PlaceIndex:
+    def _appended(self, descriptors: NDArray[np.float16]) -> PlaceIndex:
         """A copy with one more keyframe."""
         if self.words is None:
             return replace(self, count=self.count + 1)
-        vector = aggregate(descriptors, self.words)[None]
+        vector = aggregate(descriptors.astype(np.float32), self.words)[None]
         vectors = vector if self.vectors is None else np.concatenate([self.vectors, vector])
         return replace(self, vectors=vectors, count=self.count + 1)
 

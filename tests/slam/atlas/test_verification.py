@@ -174,7 +174,7 @@ def test_the_first_places_are_found_as_well_as_later_ones():
     """From elsewhere: 30 of a place's 200 descriptors, somewhat changed, and as many more of another place."""
     every, index = similar_places(90), PlaceIndex()
     for some in every[:70]:
-        index = index.with_new(some)
+        index = index.with_new(some.astype(np.float16))
     ranks = []
     for k in range(70):
         rng = np.random.default_rng(k)
