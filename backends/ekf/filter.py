@@ -24,7 +24,6 @@ from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
 from slam.window.consensus import landmarks_pose
-from slam.window.recovery import LASTING
 from slam.window.stereo import TOO_LATE, Field, RectifiedMeasurement
 
 #: Standard deviations of a known point between it and its anchor: its coordinates are linear there, it stays Gaussian.
@@ -253,12 +252,11 @@ class LandmarkFilter:
             return landmarks_pose(measure, update.landmarks.points, z, T, s.frame + 1)
 
         try:
-            found = correction(update, guess, search, s.contradicted + 1 < LASTING)
+            found = correction(update, guess, search)
             if found is None:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids.copy())
-            contradicted = s.contradicted + 1 if 2 * found.used.sum() < len(z) else 0
-            after = replace(slid.corrected(found), contradicted=contradicted)
+            after = slid.corrected(found)
         except LinAlgError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self.name}: {error}")
         used = found.used

@@ -50,26 +50,24 @@ class Gated:
     at: Linearisation  # where they are from
 
 
-def correction(update: Update, guess: Array | None, search: Search, patient: bool = False) -> Correction | None:
+def correction(update: Update, guess: Array | None, search: Search) -> Correction | None:
     """Solve with the prior, or where it fails the pose, that most observations agree with; None where there is none.
 
     It is linearised at the prior, then at the guess, a pose (4, 4), if there is one. Where less than a third of the
     observations agrees, and as many wrong ones might agree by chance, that agreement is ignored: it could move the pose
     anywhere. An agreement of a minority counts only if nothing else is found; of two, the larger. `search` is only
-    called where nothing else helps. If `patient`, a third agreeing with the prior is enough: most may be wrong once.
-    Raises LinAlgError where the reason is numerical.
+    called where nothing else helps. Raises LinAlgError where the reason is numerical.
     """
     if not (np.isfinite(update.camera.pose).all() and math.isfinite(update.covariance.P.trace())):
         raise LinAlgError("the predicted state is not finite")
     minorities, error, majority = [], None, (len(update.z) + 1) // 2
-    third = min(majority, max(MIN_CONSENSUS, len(update.z) // ONE_AGREES_IN))
     for T in (None,) if guess is None else (None, guess):
         try:
             agreed = _agreed(gate(update, T))
         except LinAlgError as reason:  # another start may do
             error = reason
             continue
-        if agreed is not None and agreed.used.sum() >= (third if patient and T is None else majority):
+        if agreed is not None and agreed.used.sum() >= majority:
             return agreed
         minorities += [] if agreed is None else [agreed]
     found = _restarted(update, search, max(MIN_CONSENSUS, majority))

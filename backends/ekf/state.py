@@ -25,7 +25,6 @@ class FilterState:
     camera: Camera
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of everything
-    contradicted: int = 0  # updates in succession that most observations contradicted
 
     @classmethod
     def first(cls, camera: Camera, P: Array) -> FilterState:
@@ -49,9 +48,7 @@ class FilterState:
         """At a later time, after a motion of the camera."""
         camera, J, noise = motion
         covariance = self.covariance.camera_moved(J, noise, pose_by_error(self.camera))
-        return replace(
-            self, stamp=stamp, frame=self.frame + 1, measured=False, camera=camera, covariance=covariance
-        )  # fmt: skip
+        return FilterState(stamp, self.frame + 1, False, camera, self.landmarks, covariance)
 
     def slid(self, slide: Slide, rows: IndexArray, r: Array) -> FilterState:
         """With landmarks of some rows (M,) of the state seen from r (3,), and their features slid there."""
