@@ -13,7 +13,7 @@ from slam.geometry.arrays import LandmarkRows
 from slam.geometry.se3 import Array, points_by_pose
 from slam.window.stereo import RectifiedStereo
 
-RECENT = 40  # cost: so many of its last measurements give a landmark's position and covariance; more tell little more
+RECENT = 12  # cost: so many of its last measurements give a landmark's position and covariance
 VARIABLE = -(10**9)  #: in place of `SmootherLandmarks.since`: no smart factor, but a variable of the graph
 
 

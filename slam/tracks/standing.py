@@ -116,14 +116,16 @@ class Standing:
     def contested(
         self, rig: StereoRig, sigma: float, features: StereoFeatures, matched: NDArray[np.intp], T_world_left: Array
     ) -> Standing:
-        """At rest no more if a motion of the camera explains all: some landmarks move with it, and few witnesses would.
+        """At rest no more if a motion of the camera explains all: landmarks left their pixels by it, few witnesses do.
 
         `sigma` is the pixel noise [px], `matched` are rows of the features that agree on a pose `T_world_left` (4, 4).
         """
         motion = inverse(T_world_left) @ self.T_world_left
-        landmarks, witnesses = (_moved_share(rig, sigma, features, rows, motion) for rows in (matched, self.witnesses))
+        left = np.setdiff1d(matched, self.witnesses)
+        moved, witnesses = (_moved(rig, sigma, features, rows, motion) for rows in (left, self.witnesses))
         # 0.1: share of landmarks that a motion must move, for it to be one
-        return self.moving() if landmarks > 0.1 and witnesses < 0.5 else self
+        explains = moved > 0.1 * len(matched) and 2 * witnesses < max(len(self.witnesses), 1)
+        return self.moving() if explains else self
 
     def unseen(self) -> Standing:
         """After a frame whose features are left out, as its images are earlier ones."""
@@ -134,15 +136,13 @@ class Standing:
         return changed(self, frames=0)
 
 
-def _moved_share(
-    rig: StereoRig, sigma: float, features: StereoFeatures, rows: NDArray[np.intp], motion: Array
-) -> float:
-    """Share of some features that a motion (4, 4) of what they see would move by more than noise."""
+def _moved(rig: StereoRig, sigma: float, features: StereoFeatures, rows: NDArray[np.intp], motion: Array) -> int:
+    """Number of some features that a motion (4, 4) of what they see would move by more than noise."""
     local = rig.triangulate(features.uv_left[rows], features.uv_right[rows])
     seen = np.isfinite(local).all(axis=1)
     z = measurement_rows(features.uv_left[rows[seen]], features.uv_right[rows[seen]])
     pixels, _ = rig.project_stereo(transform(motion, local[seen]), jacobian=False)
-    return float((((pixels - z) ** 2).sum(axis=1) > _GATE * 2.0 * sigma**2).mean()) if seen.any() else 0.0
+    return int(np.count_nonzero(((pixels - z) ** 2).sum(axis=1) > _GATE * 2.0 * sigma**2))
 
 
 def _at_rest(rig: StereoRig, before: Array, d: Array, variance: float) -> tuple[bool, float]:
