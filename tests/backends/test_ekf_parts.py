@@ -72,21 +72,9 @@ def test_a_new_angles_world_is_the_same_state(phi):
     np.testing.assert_allclose(J, jacobian(moved, np.zeros(12)), atol=1e-7)
 
 
-def test_a_body_turns_on_at_the_same_rate_if_the_covariance_is_transported():
-    """About several axes: at the angles' own rates NIS was 1.09, and sixty of 6000 matches were refused."""
-    first = EulerCamera.first(MODELS, True)
-    camera = replace(first, x=np.concatenate([first.x[:9], [0.8, -0.6, 1.2]]))
-    after, A, _ = camera.advanced(0.1)
-    rate, E = body_rate_matrix(camera.x[3:6]) @ camera.x[9:], body_rate_matrix(after.x[3:6])
-    np.testing.assert_allclose(E @ after.x[9:], rate, atol=1e-12)
-    error = np.append(np.zeros(9), [0.01, 0.02, -0.01])
-    other = camera.moved(error).advanced(0.1)[0].x
-    np.testing.assert_allclose(body_rate_matrix(other[3:6]) @ other[9:] - rate, E @ A[9:, 9:] @ error[9:], atol=1e-12)
-
-
 def test_a_step_in_pieces_has_the_noise_of_a_whole_one():
     """A fast turn runs through the singularity; its position, and turns about the body, had less than a slow one's."""
-    first = EulerCamera.first(MODELS, False)
+    first = EulerCamera.first(MODELS, True)
     shifts, turns = [], []
     for rate in (np.zeros(3), np.array([0.0, 4.0, 0.0])):
         camera = replace(first, x=np.concatenate([first.x[:9], rate]))
