@@ -75,6 +75,15 @@ def test_a_motion_that_explains_landmarks_and_moves_no_witness_ends_the_rest():
     assert standing.contested(RIG, SIGMA, scene.seen(6, np.eye(4), np.zeros(3)), np.arange(400), there).stands
 
 
+@pytest.mark.parametrize("far", [0.012, 0.014, 0.016])
+def test_landmarks_that_stay_do_not_end_the_rest_where_their_pose_is_somewhat_off(far):
+    """By a centimetre near points would move by more than noise: they have not, so the pose is no motion."""
+    scene = Scene(0.0)
+    standing = after([scene.seen(k, np.eye(4), np.zeros(3)) for k in range(6)])
+    features, there = scene.seen(6, np.eye(4), np.zeros(3)), exp(np.array([0, 0, 0, far, 0, 0]))
+    assert standing.contested(RIG, SIGMA, features, standing.witnesses[:100], there).stands
+
+
 def test_a_rest_lasts_while_something_hides_all_that_stays_for_some_frames():
     scene = Scene(0.9)
     standing = after([scene.seen(k, np.eye(4), np.zeros(3), False) for k in range(8)])
