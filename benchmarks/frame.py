@@ -9,8 +9,9 @@ fast as it goes; PYTHON, by default what the variable ORBSLAM3 names, is the int
 which ``orbslam3-python`` is installed (``python -m venv E && E/bin/pip install orbslam3-python``), which is never
 imported here. Median times; compare the ratios, not the milliseconds. ORB-SLAM3's vocabulary is a small one of
 rendered images, good for tracking.
-A second table has the CPU time of each stage, and the way of a frame through the code (`calls`): files entered, calls
-from one file to another, and Python calls in all, the back end left out.
+A second table has the CPU time of each stage, how much there was to do (features, landmarks of the map, those that were
+matched, those that measured the pose), and the way of a frame through the code (`calls`): files entered, calls from one
+file to another, and Python calls in all, the back end left out.
 
 The first size is that of KITTI odometry 06 where SLAM_DATA has it, else of the same size rendered; MH_01 of EuRoC is
 left out where it has not.
@@ -52,7 +53,8 @@ KITTI, EUROC = "kitti_odometry/sequences/06", "euroc/MH_01_part"
 HEADER = ("images", "what", "wall [ms]", "CPU [ms]", "wall / SIFT", "CPU / SIFT", "wall / ORB-SLAM3", "CPU / ORB-SLAM3",
           "frames lost", "ATE [mm]")  # fmt: skip
 STAGES = ("extract", "predict", "associate", "update", "estimate", "objects", "manage", "atlas")
-WAYS = ("images", "what", *(f"{name} [ms]" for name in STAGES), "files", "calls between files", "Python calls")
+COUNTS = ("features", "landmarks", "matched", "measured")  # of a frame: of the image, of the map, and of these
+WAYS = ("images", "what", *(f"{name} [ms]" for name in STAGES), *COUNTS, "files", "calls between files", "Python calls")
 SIFT, ORBSLAM3 = "cv2.SIFT, 800 features, left", "ORB-SLAM3"
 OVERLAP = "{}, overlap"  # of a back end
 
@@ -137,12 +139,13 @@ def ways(size: Size) -> Iterable[list[str]]:
         clock, compilation.working_time = compilation.working_time, time.process_time
         try:
             system = StereoSlam(sequence.rig, backend=name, kind=sequence.kind)
-            spent = [system.process(frame).milliseconds for frame in sequence.frames(0, last)][size.skipped :]
+            results = [system.process(frame) for frame in sequence.frames(0, last)][size.skipped :]
         finally:
             compilation.working_time = clock
         way = np.median([w.summary() for w in ways_of(sequence, name, size.skipped, last)], axis=0)
-        by_stage = (np.median([s.get(stage, 0.0) for s in spent]) for stage in STAGES)
-        yield [size.name, name, *(f"{x:.1f}" for x in by_stage), *(f"{x:.0f}" for x in way)]
+        by_stage = (np.median([r.milliseconds.get(stage, 0.0) for r in results]) for stage in STAGES)
+        counts = np.median([(len(r.features), r.map_size, len(r.matched), len(r.report.used)) for r in results], axis=0)
+        yield [size.name, name, *(f"{x:.1f}" for x in by_stage), *(f"{x:.0f}" for x in (*counts, *way))]
 
 
 def tracked(result: FrameResult) -> Array | None:
