@@ -109,16 +109,13 @@ def why_degenerate(points: Array) -> str:
     return ""
 
 
-def motion_of_triples(current: Array, initial: Array, origin: Array) -> tuple[Array, Array]:
-    """``R_2^1`` (3, 3) and ``AA′`` (3,) from three points in the current and initial scene (steps b to e)."""
-    R = body_frame(*current) @ body_frame(*initial).T
-    return R, current[0] + R @ (origin - initial[0]) - origin
-
-
 def placed(current: Array, initial: Array, origin: Array) -> Array:
-    """Pose (4, 4) of the object by three points (3, 3) in the current and initial scene [m]."""
-    R, AA = motion_of_triples(current, initial, origin)
-    return pose(R, origin + AA)
+    """Pose (4, 4) [m] of the object by three points (3, 3) in the current and initial scene (steps b to e).
+
+    Its rotation is ``R_2^1``, and it lies ``AA′`` from the `origin`.
+    """
+    R = body_frame(*current) @ body_frame(*initial).T
+    return pose(R, current[0] + R @ (origin - initial[0]))
 
 
 def detect(

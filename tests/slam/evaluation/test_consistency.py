@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slam.data import CommonError
-from slam.evaluation.consistency import consistency_figures, stretch_nees
+from slam.evaluation.consistency import consistency_figures
 from slam.evaluation.joint_errors import JointErrors
 from slam.evaluation.summary import evaluate
 from slam.geometry.se3 import adjoint, exp, inverse
@@ -21,22 +21,22 @@ SIGMA = np.array([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.02])
 NONE = TruthNoise()
 
 
-def odometry(seed: int, frames: int = 60, noise: TruthNoise = NONE, claimed: float = 1.0):
+def odometry(seed: int, frames: int = 60, noise: TruthNoise = NONE):
     """Estimated and true path, and the covariances that the estimate claims."""
     rng = np.random.default_rng(seed)
     A, P = adjoint(inverse(exp(STEP))), [1e-12 * np.eye(6)]
     true = chained([exp(STEP)] * (frames - 1))
     own = chained(exp(STEP) @ exp(SIGMA * rng.normal(size=(frames - 1, 6))))
     for _ in range(frames - 1):
-        P.append(A @ P[-1] @ A.T + claimed**2 * np.diag(SIGMA**2))
+        P.append(A @ P[-1] @ A.T + np.diag(SIGMA**2))
     scale = np.repeat([noise.rotation, noise.translation], 3)
     seen = np.array([T @ exp(scale * rng.normal(size=6)) for T in true])
     stamps = np.arange(frames) * 0.1
     return Trajectory(stamps, own), Trajectory(stamps, seen), np.array(P)
 
 
-def mean_over_seeds(noise: TruthNoise = NONE, claimed: float = 1.0) -> dict[str, float]:
-    runs = [consistency_figures(*odometry(seed, noise=noise, claimed=claimed), noise) for seed in range(40)]
+def mean_over_seeds(noise: TruthNoise = NONE) -> dict[str, float]:
+    runs = [consistency_figures(*odometry(seed, noise=noise), noise) for seed in range(40)]
     return {key: float(np.mean([run[key] for run in runs])) for key in runs[0]}
 
 
@@ -50,10 +50,6 @@ def test_relative_nees_of_honest_odometry_is_six():
     assert noisy["share of truth over 10 m"] > 0.9 and 5.0 < noisy["NEES over 10 m"] < 7.0
     band = f"{np.sqrt(figures['band low'] / 6):.2f} to {np.sqrt(figures['band high'] / 6):.2f}"
     assert band in verdict({"ratio_start": 1.0})  # one band in a summary and in what is said of it
-
-
-def test_relative_nees_tells_covariances_that_are_too_small():
-    assert mean_over_seeds(claimed=0.2)["NEES over 10 m"] > 60
 
 
 def with_noise_of_each_frame(seed: int) -> tuple[Trajectory, Trajectory, np.ndarray, list[np.ndarray]]:
@@ -105,13 +101,6 @@ def test_a_constant_turn_of_the_truths_sensor_is_no_rotation_error():
     )
     assert exact > 1.2 * plain
     assert known < 1.05 * plain
-
-
-def test_stretches_without_a_usable_covariance_are_left_out():
-    own, true, P = odometry(0)
-    P[30] = 1e-9 * np.eye(6)  # as after a loop: smaller than before it
-    first = np.arange(20, 30)
-    assert np.isnan(stretch_nees(own, true, P, NONE, first, np.full(10, 30))[0]).all()
 
 
 def test_a_length_over_which_the_frames_own_errors_are_larger_than_the_growth_has_no_figure():

@@ -33,12 +33,6 @@ def test_so3_log_over_all_angles(angle, axis):
     np.testing.assert_allclose(se3.so3_exp(w), se3.so3_exp(angle * np.array(axis)), atol=1e-9)
 
 
-def test_batches_agree_with_single():
-    xi = np.random.default_rng(0).normal(size=(7, 6))
-    np.testing.assert_allclose(se3.exp(xi), [se3.exp(x) for x in xi], atol=1e-15)
-    np.testing.assert_allclose(se3.log(se3.exp(xi)), [se3.log(se3.exp(x)) for x in xi], atol=1e-15)
-
-
 @given(twists, twists)
 def test_adjoint_moves_a_twist_through_a_pose(a, b):
     T = se3.exp(a)

@@ -88,8 +88,9 @@ def test_raw_images_have_the_rig_that_the_rectified_ones_come_from(bag: Path) ->
     assert rig.baseline == pytest.approx(0.2)
 
 
-def test_rectified_images_have_the_rig_of_p(tmp_path: Path) -> None:
-    rows = [(t.replace("image_raw", "image_rect"), *rest) for t, *rest in stereo(STORES[1])]
+def test_rectified_images_come_before_raw_ones_and_have_the_rig_of_p(tmp_path: Path) -> None:
+    rows = stereo(STORES[1])
+    rows += [(t.replace("image_raw", "image_rect"), *rest) for t, *rest in rows if t.endswith("image_raw")]
     path = write(tmp_path / "rect.bag", rows)
     rig = slam.open_sequence(path).rig
     assert rig.is_rectified
