@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from backends.ekf.camera import Camera, Motion, displacement, from_body_axes, pose_by_error, predicted, prior
+from backends.ekf.camera import Camera, Motion, from_body_axes, pose_by_error, predicted, prior
 from backends.ekf.covariance import CAMERA, POSE, RECENT, Covariance, positive
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
@@ -41,6 +41,7 @@ class LandmarkFilter:
         camera: the first one, in its prior.
         coordinates: of the landmarks.
         iterations: most linearisations of an update.
+        kept: most landmarks that keep their covariance with the camera; see `FilterState`. None: all.
         stereo: whether the right pixel is measured.
 
     Attributes:
@@ -54,11 +55,11 @@ class LandmarkFilter:
 
     def __init__(
         self, rig: StereoRig, models: EstimatorModels, camera: Camera, coordinates: Coordinates, iterations: int,
-        stereo: bool = True, /,
+        kept: int | None, stereo: bool = True, /,
     ) -> None:  # fmt: skip
         # by position alone: they are no options of a back end
         self.rig, self.models = rig, models
-        self._coordinates, self._iterations, self._stereo = coordinates, iterations, stereo
+        self._coordinates, self._iterations, self._kept, self._stereo = coordinates, iterations, kept, stereo
         self._measure = RectifiedMeasurement(rig, models.with_slide())
         self._slide = Slide.of(models, self._measure.stereo.f)
         self.state = FilterState.first(camera, from_body_axes(camera, prior(models)))
@@ -143,8 +144,8 @@ class LandmarkFilter:
         anchors[:, :, 3] = positions
         deviations = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         anchors[:, 2, 3] -= np.clip(_STAND_OFF * deviations, 1.0, _FARTHEST_ANCHOR)
-        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions)
-        new = replace(new, sights=np.full((len(ids), 3), np.nan))
+        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, -1)
+        new = replace(new, sights=np.full((len(ids), 3), np.nan), known=np.ones(len(ids), bool))
         D = new.gauge[:, :, :3]
         self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
 
@@ -189,7 +190,8 @@ class LandmarkFilter:
         """
         s, stereo = replace(self.state, measured=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
-            marks = s.landmarks.select(slice(s.covariance.correlated))
+            rows = np.arange(len(s.landmarks))
+            marks = s.landmarks.select(~s.landmarks.known | (rows < s.covariance.correlated))
             z, _ = stereo.project(se3.transform(se3.inverse(s.pose), marks.points))
             T = np.where(self.rig.left.in_image(z[:, :2])[:, None, None], s.pose[:3], marks.anchors)
             z, _ = stereo.project(((marks.points - T[:, :, 3])[:, None] @ T[:, :, :3])[:, 0])
@@ -211,7 +213,7 @@ class LandmarkFilter:
 
     def _moved_on(self, stamp: float, rests: bool) -> Prediction:
         """Go to a time, and say what is in the angle of view then; whether the camera rests meanwhile."""
-        s = self.state
+        s = self.state if self._kept is None else self.state.with_most(self._kept)
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
         motion: Motion = s.camera, np.eye(CAMERA), np.zeros((CAMERA, CAMERA))
         if s.frame >= 0:
@@ -219,12 +221,9 @@ class LandmarkFilter:
         T = motion[0].pose
         rows = self._measure.visible(T, s.landmarks.points)
         after = s.advanced(float(stamp), motion)
-        marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
-        blocks += self._slide.walked(after.landmarks, rows, T[:3, 3])[1]
+        marks, walk = after.landmarks.select(rows), self._slide.walked(after.landmarks, rows, T[:3, 3])[1]
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
-        by_pose = -toward @ (marks.gauge @ displacement(after.camera))  # (M, 3, 6), of them as seen from the camera
-        local = (by_pose @ after.covariance.pose + 2 * toward @ cross) @ by_pose.transpose(0, 2, 1)
-        local = 0.5 * (local + local.transpose(0, 2, 1)) + toward @ blocks @ toward.transpose(0, 2, 1)
+        local = toward @ (after.from_camera(rows) + walk) @ toward.transpose(0, 2, 1)
         left, right, S = self._measure.pixels((marks.points - T[:3, 3]) @ T[:3, :3], local)
         prediction = Prediction(after.stamp, T.copy(), after.pose_covariance(), marks.ids, left, right, S)
         self._past[after.frame - 1 :] = [(s.stamp, s.pose)] if after.frame else []

@@ -8,16 +8,26 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from backends.ekf.camera import Camera, Motion, displacement, pose_by_error, transport
-from backends.ekf.covariance import HEAD, Covariance
+from backends.ekf.covariance import HEAD, POSE, Apart, Covariance
 from backends.ekf.innovation import Correction
 from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
+from slam.window.stereo import relative_covariance
+
+_AT_ONCE = 8  # cost: one of so many landmarks leaves at once, so that the matrix is not copied in every frame
 
 
 @dataclass(frozen=True, eq=False)
 class FilterState:
-    """A camera and three coordinates per landmark, with the joint covariance of their errors."""
+    """A camera and three coordinates per landmark, with the joint covariance of their errors.
+
+    Landmarks that were measured long ago leave the matrix. They stay in the map, where they were, with their covariance
+    in the world. As seen from the camera, they are as uncertain as when they left, and by its way since: what it has
+    travelled is the sum over its steps of their covariances, as if they were independent, each as a displacement of the
+    world. So are they predicted, and so do those that are measured again join, as new ones would: independent of the
+    pose as seen from the camera. They tell it nothing of the past, and nothing is counted twice.
+    """
 
     stamp: float  # time [s]; NaN before the first prediction
     frame: int  # number of the prediction, −1 before the first
@@ -25,11 +35,14 @@ class FilterState:
     camera: Camera
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of everything
+    before: Array  # the pose (4, 4) of the prediction before
+    travelled: Array  # what the camera had travelled then (6, 6)
 
     @classmethod
     def first(cls, camera: Camera, P: Array) -> FilterState:
         """Before the first prediction, with the covariance (12, 12) of the camera's error."""
-        return cls(float("nan"), -1, True, camera, FilterLandmarks.none(), Covariance.of_camera(P))
+        covariance, still = Covariance.of_camera(P), np.zeros((POSE, POSE))
+        return cls(float("nan"), -1, True, camera, FilterLandmarks.none(), covariance, camera.pose, still)
 
     # --- the camera ---
 
@@ -48,7 +61,33 @@ class FilterState:
         """At a later time, after a motion of the camera."""
         camera, J, noise = motion
         covariance = self.covariance.camera_moved(J, noise, pose_by_error(self.camera))
-        return FilterState(stamp, self.frame + 1, False, camera, self.landmarks, covariance)
+        return FilterState(
+            stamp, self.frame + 1, False, camera, self.landmarks, covariance, self.pose, self.travelled_now()
+        )  # fmt: skip
+
+    def travelled_now(self) -> Array:
+        """What the camera has travelled by now (6, 6)."""
+        if self.frame < 1:
+            return self.travelled
+        J = pose_by_error(self.camera)
+        step = relative_covariance(self.covariance.joint_poses(J, 2), self.before, self.pose)
+        D = np.linalg.solve(J.T, displacement(self.camera).T).T
+        return np.asarray(self.travelled + D @ step @ D.T)
+
+    def from_camera(self, rows: IndexArray) -> Array:
+        """Covariances (M, 3, 3) of landmarks' errors, in their coordinates, as seen from the camera."""
+        own, cross = self.covariance.marginals(rows)
+        B = self.landmarks.gauge[rows] @ displacement(self.camera)
+        own += (B @ self.covariance.pose - 2 * cross) @ B.transpose(0, 2, 1)
+        left = (rows >= self.covariance.correlated) & ~self.landmarks.known[rows]
+        if left.any():
+            own[left] = self._since_they_left(rows[left])
+        return np.asarray(0.5 * (own + own.transpose(0, 2, 1)))
+
+    def _since_they_left(self, rows: IndexArray) -> Array:
+        """As above, of some that have left."""
+        apart, G = self.covariance.apart.select(rows - self.covariance.correlated), self.landmarks.gauge[rows]
+        return np.asarray(apart.seen + G @ (self.travelled_now() - apart.since) @ G.transpose(0, 2, 1))
 
     def slid(self, slide: Slide, rows: IndexArray, r: Array) -> FilterState:
         """With landmarks of some rows (M,) of the state seen from r (3,), and their features slid there."""
@@ -69,43 +108,76 @@ class FilterState:
         if not len(ids):
             return self
         R, anchors = self.pose[:3, :3], np.repeat(self.pose[None, :3], len(h), axis=0)
-        new = FilterLandmarks.at(coordinates, ids, anchors, self.pose[:3, 3] + h @ R.T)
-        D = new.gauge[:, :, :3] @ R
-        noise = D @ covariances @ D.transpose(0, 2, 1)
-        by_rig = np.zeros((len(h), 3, self.covariance.by_rig.shape[1])) if by_rig is None else D @ by_rig
-        covariance = self.covariance.appended(new.gauge @ displacement(self.camera), noise, by_rig)
-        end = self.covariance.correlated
-        landmarks = self.landmarks.select(slice(end)).joined(new).joined(self.landmarks.select(slice(end, None)))
-        return replace(self, measured=True, landmarks=landmarks, covariance=covariance)
+        new = FilterLandmarks.at(coordinates, ids, anchors, self.pose[:3, 3] + h @ R.T, self.frame)
+        D, J = new.gauge[:, :, :3] @ R, new.gauge @ displacement(self.camera)
+        moved = J @ self.covariance.by_rig[:POSE] + (0.0 if by_rig is None else D @ by_rig)
+        noise = _block_diagonal(D @ covariances @ D.transpose(0, 2, 1))
+        return replace(self, measured=True)._with(new, self.covariance.appended(J, noise, moved))
 
     def inserted(self, new: FilterLandmarks, covariances: Array) -> FilterState:
         """With landmarks known from elsewhere, by covariances (M, 3, 3) of their coordinates."""
-        known = np.concatenate([self.covariance.known, covariances])
-        covariance = replace(self.covariance, known=known)
-        return replace(self, landmarks=self.landmarks.joined(new), covariance=covariance)
+        return self._with_apart(new, Apart.known(covariances, self.covariance.by_rig.shape[1]))
 
     def removed(self, ids: IdArray) -> FilterState:
         """Without some landmarks (M,)."""
-        gone = self.landmarks.rows_of(ids)
-        return self._rearranged(*(np.setdiff1d(part, gone) for part in self._parts())) if len(ids) else self
+        return self._without(self.landmarks.rows_of(ids)) if len(ids) else self
 
     def with_all_of(self, ids: IdArray) -> FilterState:
-        """With some landmarks (M,), which may be known from elsewhere, in the state."""
-        rows, (state, known) = self.landmarks.rows_of(ids), self._parts()
-        joining = np.sort(rows[rows >= len(state)])
-        if not len(joining):
+        """With some landmarks (M,), which may be apart, in the state.
+
+        Those that left together are as uncertain together by the camera's way since. Those of a prior map are
+        independent of the pose in the world.
+        """
+        rows = self.landmarks.rows_of(ids)
+        rows = np.sort(rows[rows >= self.covariance.correlated])
+        if not len(rows):
             return self
-        return self._rearranged(np.concatenate([state, joining]), np.setdiff1d(known, joining))
+        apart, new = self.covariance.apart.select(rows - self.covariance.correlated), self.landmarks.select(rows)
+        G = np.where(new.known[:, None, None], 0.0, new.gauge)
+        moved = G @ (self.travelled_now() - apart.since)
+        together = apart.since[:, 0, 0, None] == apart.since[:, 0, 0]
+        way = (moved[:, None] @ G.transpose(0, 2, 1)) * together[:, :, None, None]
+        noise = _block_diagonal(apart.seen) + way.transpose(0, 2, 1, 3).reshape(3 * len(rows), -1)
+        s = self._without(rows)
+        return s._with(new, s.covariance.appended(G @ displacement(self.camera), noise, apart.by_rig))
 
-    def _parts(self) -> tuple[IndexArray, IndexArray]:
-        """Rows of the landmarks that are in the state, and of those that are known from elsewhere."""
-        rows, count = np.arange(len(self.landmarks)), self.covariance.correlated
-        return rows[:count], rows[count:]
+    def with_most(self, most: int) -> FilterState:
+        """With so many landmarks in the state, at most, besides those of a prior map and those that are measured now.
 
-    def _rearranged(self, state: IndexArray, known: IndexArray) -> FilterState:
-        """With the landmarks of these rows of the table in each part."""
-        landmarks = self.landmarks.select(np.concatenate([state, known]))
-        return replace(self, landmarks=landmarks, covariance=self.covariance.rearranged(state, known))
+        Those that were measured longest ago leave it.
+        """
+        may = np.flatnonzero(~self.landmarks.known[: self.covariance.correlated])
+        if len(may) <= most:
+            return self
+        last = self.landmarks.last[may]
+        oldest = np.argsort(last, kind="stable")[: len(may) - most + most // _AT_ONCE]
+        rows = np.sort(may[oldest[last[oldest] < self.frame]])
+        since, covariance = np.tile(self.travelled_now(), (len(rows), 1, 1)), self.covariance
+        left = Apart(covariance.marginals(rows)[0], self.from_camera(rows), since, covariance.landmarks_by_rig(rows))
+        return self._without(rows)._with_apart(self.landmarks.select(rows), left)
+
+    def _state(self) -> slice:
+        """Rows of the landmarks that are in the state."""
+        return slice(self.covariance.correlated)
+
+    def _without(self, gone: IndexArray) -> FilterState:
+        """Without the landmarks of some rows of the table."""
+        stays, count = np.delete(np.arange(len(self.landmarks)), gone), self.covariance.correlated
+        covariance = self.covariance.only(stays[stays < count], stays[stays >= count])
+        return replace(self, landmarks=self.landmarks.select(stays), covariance=covariance)
+
+    def _with(self, new: FilterLandmarks, covariance: Covariance) -> FilterState:
+        """With new landmarks, the last ones of the state."""
+        state, apart = (
+            self.landmarks.select(self._state()),
+            self.landmarks.select(slice(self.covariance.correlated, None)),
+        )
+        return replace(self, landmarks=state.joined(new).joined(apart), covariance=covariance)
+
+    def _with_apart(self, new: FilterLandmarks, what: Apart) -> FilterState:
+        """With new landmarks that are apart."""
+        covariance = replace(self.covariance, apart=self.covariance.apart.joined(what))
+        return replace(self, landmarks=self.landmarks.joined(new), covariance=covariance)
 
     # --- updates ---
 
@@ -120,7 +192,8 @@ class FilterState:
         and Bonnabel, 2015). Raises LinAlgError where the new state is not finite, or a variance is lost in rounding.
         """
         update, camera = found.at.update, found.camera
-        marks = self.landmarks.moved(update.coordinates, self._parts()[0], found.change[HEAD:].reshape(-1, 3))
+        marks = self.landmarks.moved(update.coordinates, self._state(), found.change[HEAD:].reshape(-1, 3))
+        marks.last[update.rows[found.used]] = self.frame
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise LinAlgError("the corrected state is not finite")
         J, shift = transport(update.camera, camera), self._shift(marks, camera)
@@ -143,5 +216,12 @@ class FilterState:
 
     def _shift(self, marks: FilterLandmarks, camera: Camera) -> Array:
         """What is added to the errors (N, 3, 6) of landmarks that have moved, by the error of the pose."""
-        change = (marks.gauge - self.landmarks.gauge)[self._parts()[0]]
+        change = (marks.gauge - self.landmarks.gauge)[self._state()]
         return np.asarray(change @ displacement(camera) if camera.transports else np.zeros_like(change))
+
+
+def _block_diagonal(blocks: Array) -> Array:
+    """A matrix (3M, 3M) of the blocks (M, 3, 3) on its diagonal."""
+    each, out = np.arange(len(blocks)), np.zeros((len(blocks), 3, len(blocks), 3))
+    out[each, :, each] = blocks
+    return out.reshape(3 * len(blocks), -1)
