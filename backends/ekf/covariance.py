@@ -13,13 +13,13 @@ field F. Their own covariance is not needed here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg.blas import dsyr2k, dsyrk
 
 from slam.data import IndexArray
-from slam.geometry.arrays import Table
+from slam.geometry.arrays import Table, changed
 from slam.geometry.se3 import Array
 from slam.runtime.compilation import kernel
 
@@ -83,20 +83,18 @@ class Covariance:
         """Where the coordinates (M, 3) of landmarks stand, by rows of the table."""
         return np.asarray(HEAD + 3 * rows[:, None] + np.arange(3))
 
-    def marginals(self, rows: IndexArray) -> tuple[Array, Array]:
-        """Covariances (M, 3, 3) of landmarks, and theirs (M, 3, 6) with the camera's [r, φ]; by rows of the table."""
-        blocks, with_pose, there = np.empty((len(rows), 3, 3)), np.zeros((len(rows), 3, POSE)), rows < self.correlated
-        at = self.numbers(rows[there])
-        blocks[there], with_pose[there] = self.P[at[:, :, None], at[:, None, :]], self.P[at, :POSE]
-        blocks[~there] = self.apart.own[rows[~there] - self.correlated]
-        return blocks, with_pose
+    def marginals(self, rows: IndexArray) -> tuple[Array, Array, Array]:
+        """Of landmarks, by rows of the table: covariances (M, 3, 3), also (M, 3, 6) with the camera's [r, φ], `by_rig`.
 
-    def landmarks_by_rig(self, rows: IndexArray) -> Array:
-        """Derivatives (M, 3, m) of some landmarks by errors of the rig."""
-        out, there = np.empty((len(rows), 3, self.by_rig.shape[1])), rows < self.correlated
-        out[there] = self.by_rig[self.numbers(rows[there])]
-        out[~there] = self.apart.by_rig[rows[~there] - self.correlated]
-        return out
+        The last are derivatives (M, 3, m) by errors of the rig.
+        """
+        there, M = rows < self.correlated, len(rows)
+        at, apart = self.numbers(rows[there]), self.apart.select(rows[~there] - self.correlated)
+        own, with_pose, by_rig = np.empty((M, 3, 3)), np.zeros((M, 3, POSE)), np.empty((M, 3, self.by_rig.shape[1]))
+        own[there], own[~there] = self.P[at[:, :, None], at[:, None, :]], apart.own
+        by_rig[there], by_rig[~there] = self.by_rig[at], apart.by_rig
+        with_pose[there] = self.P[at, :POSE]
+        return own, with_pose, by_rig
 
     def joint_poses(self, J: Array, n: int) -> Array:
         """Joint covariance (6n, 6n) of the last poses, the present one, J (6, 6) times [r, φ], last."""
@@ -124,13 +122,13 @@ class Covariance:
         own[:CAMERA, :CAMERA] += noise
         P[:HEAD, :HEAD] = 0.5 * (own + own.T)
         P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
-        return replace(self, P=P, by_rig=by_rig)
+        return changed(self, P=P, by_rig=by_rig)
 
     def walked(self, rows: IndexArray, walk: Array) -> Covariance:
         """After landmarks (`rows` (M,) of the table, none of those that are apart) walk by (M, 3, 3)."""
         P, at = self.P.copy(), self.numbers(rows)
         P[at[:, :, None], at[:, None, :]] += walk
-        return replace(self, P=P)
+        return changed(self, P=P)
 
     # --- landmarks join and leave ---
 
@@ -144,7 +142,7 @@ class Covariance:
         P[:n, :n], P[n:, :n], P[:n, n:] = self.P, cross, cross.T
         own = cross[:, :POSE] @ by_pose.T + noise
         P[n:, n:] = positive(0.5 * (own + own.T), own.diagonal(), POSE)
-        return replace(self, P=P, by_rig=np.concatenate([self.by_rig, by_rig.reshape(len(by_pose), -1)]))
+        return changed(self, P=P, by_rig=np.concatenate([self.by_rig, by_rig.reshape(len(by_pose), -1)]))
 
     def only(self, rows: IndexArray, apart: IndexArray) -> Covariance:
         """With these landmarks alone, in each of its two parts; by their rows of the table of landmarks."""
@@ -177,7 +175,7 @@ class Covariance:
         summands = self.P.diagonal() + 2 * (half * D).sum(axis=1)
         summands[last] = 0.0
         mirror(P, len(P))
-        return replace(self, P=positive(P, summands, V.shape[1]), by_rig=by_rig)
+        return changed(self, P=positive(P, summands, V.shape[1]), by_rig=by_rig)
 
     def displaced(self, rows: IndexArray, change: Array, shift: Array) -> Covariance:
         """After a change (M, 3) of some landmarks' coordinates that is none of their error, with a shift as above.
@@ -187,10 +185,8 @@ class Covariance:
         by_rig, apart, there = self.by_rig.copy(), self.apart.by_rig.copy(), rows < self.correlated
         by_rig[self.numbers(rows[there]), -1:] -= change[there, :, None]
         apart[rows[~there] - self.correlated, :, -1:] -= change[~there, :, None]
-        moved, nothing = (
-            replace(self, by_rig=by_rig, apart=replace(self.apart, by_rig=apart)),
-            np.zeros((len(self.P), 0)),
-        )
+        moved = changed(self, by_rig=by_rig, apart=changed(self.apart, by_rig=apart))
+        nothing = np.zeros((len(self.P), 0))
         return moved.corrected(nothing, 0 * by_rig, np.eye(CAMERA), shift)
 
 

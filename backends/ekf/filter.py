@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -18,6 +17,7 @@ from slam.checks import known_landmarks, require_guess, require_not_measured, re
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
+from slam.geometry.arrays import changed
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
@@ -83,7 +83,7 @@ class LandmarkFilter:
         s = self._started("update")
         require_not_measured(self.name, s.measured)
         require_guess(self.name, guess)
-        s = replace(s.with_all_of(observations.ids), measured=True)
+        s = changed(s.with_all_of(observations.ids), measured=True)
         s, report = self._updated(s, observations, guess)
         self.state = s
         return report
@@ -145,7 +145,7 @@ class LandmarkFilter:
         deviations = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         anchors[:, 2, 3] -= np.clip(_STAND_OFF * deviations, 1.0, _FARTHEST_ANCHOR)
         new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, -1)
-        new = replace(new, sights=np.full((len(ids), 3), np.nan), known=np.ones(len(ids), bool))
+        new = changed(new, sights=np.full((len(ids), 3), np.nan), known=np.ones(len(ids), bool))
         D = new.gauge[:, :, :3]
         self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
 
@@ -166,15 +166,15 @@ class LandmarkFilter:
         by_rig = np.zeros((CAMERA, m))
         if pose is not None:
             by_rig[:POSE] = np.linalg.solve(pose_by_error(s.camera), pose)
-        self._measure = replace(self._measure, field=field)
-        self.state = replace(s, covariance=Covariance.of_camera(s.covariance.camera, by_rig))
+        self._measure = changed(self._measure, field=field)
+        self.state = changed(s, covariance=Covariance.of_camera(s.covariance.camera, by_rig))
 
     def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
         """See `slam.interfaces.ConsideringBackend.sensitivities`."""
         s = self._started("sensitivities")
         rows = s.landmarks.rows_of(ids)
         D = self._coordinates.jacobian(s.landmarks.anchors[rows], s.landmarks.c[rows])
-        return pose_by_error(s.camera) @ s.covariance.by_rig[:POSE], D @ s.covariance.landmarks_by_rig(rows)
+        return pose_by_error(s.camera) @ s.covariance.by_rig[:POSE], D @ s.covariance.marginals(rows)[2]
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
@@ -188,7 +188,7 @@ class LandmarkFilter:
         are now, would look as if the camera had moved. Those of a prior map that were not measured yet were placed by
         no pixels: they stay.
         """
-        s, stereo = replace(self.state, measured=True), self._measure.stereo
+        s, stereo = changed(self.state, measured=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
             rows = np.arange(len(s.landmarks))
             marks = s.landmarks.select(~s.landmarks.known | (rows < s.covariance.correlated))

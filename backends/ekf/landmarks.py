@@ -10,12 +10,12 @@ state has three numbers a landmark as before and everything else stays as it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from slam.data import BoolArray, IdArray, IndexArray
-from slam.geometry.arrays import LandmarkRows
+from slam.geometry.arrays import LandmarkRows, changed
 from slam.geometry.se3 import Array, hat
 from slam.models import EstimatorModels
 
@@ -127,7 +127,7 @@ class FilterLandmarks(LandmarkRows):
         c[rows] = coordinates.moved(self.c[rows], change)
         points[rows] = coordinates.points(anchors, c[rows])
         gauge[rows] = gauge_jacobian(coordinates, anchors, c[rows], points[rows])
-        return replace(self, c=c, points=points, gauge=gauge, last=last)
+        return changed(self, c=c, points=points, gauge=gauge, last=last)
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ class Slide:
         sights[rows[walk]] = (sight / distance)[walk]
         across = (distance**2)[:, :, None] * np.eye(3) - sight[:, :, None] * sight[:, None, :]
         noise = (self.density**2 * np.where(walk, angle, 0.0))[:, None, None] * (D @ across @ D.transpose(0, 2, 1))
-        return replace(marks, sights=sights), noise
+        return changed(marks, sights=sights), noise
 
 
 def gauge_jacobian(coordinates: Coordinates, anchors: Array, c: Array, points: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -12,6 +12,7 @@ from backends.ekf.covariance import HEAD, POSE, Apart, Covariance
 from backends.ekf.innovation import Correction
 from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
 from slam.data import IdArray, IndexArray
+from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array
 from slam.window.stereo import relative_covariance
 
@@ -76,24 +77,20 @@ class FilterState:
 
     def from_camera(self, rows: IndexArray) -> Array:
         """Covariances (M, 3, 3) of landmarks' errors, in their coordinates, as seen from the camera."""
-        own, cross = self.covariance.marginals(rows)
-        B = self.landmarks.gauge[rows] @ displacement(self.camera)
+        (own, cross, _), G = self.covariance.marginals(rows), self.landmarks.gauge[rows]
+        B, count = G @ displacement(self.camera), self.covariance.correlated
         own += (B @ self.covariance.pose - 2 * cross) @ B.transpose(0, 2, 1)
-        left = (rows >= self.covariance.correlated) & ~self.landmarks.known[rows]
+        left = (rows >= count) & ~self.landmarks.known[rows]
         if left.any():
-            own[left] = self._since_they_left(rows[left])
+            apart, G = self.covariance.apart.select(rows[left] - count), G[left]
+            own[left] = apart.seen + G @ (self.travelled_now() - apart.since) @ G.transpose(0, 2, 1)
         return np.asarray(0.5 * (own + own.transpose(0, 2, 1)))
-
-    def _since_they_left(self, rows: IndexArray) -> Array:
-        """As above, of some that have left."""
-        apart, G = self.covariance.apart.select(rows - self.covariance.correlated), self.landmarks.gauge[rows]
-        return np.asarray(apart.seen + G @ (self.travelled_now() - apart.since) @ G.transpose(0, 2, 1))
 
     def slid(self, slide: Slide, rows: IndexArray, r: Array) -> FilterState:
         """With landmarks of some rows (M,) of the state seen from r (3,), and their features slid there."""
         landmarks, walk = slide.walked(self.landmarks, rows, r)
         covariance = self.covariance.walked(rows, walk) if walk.any() else self.covariance
-        return replace(self, landmarks=landmarks, covariance=covariance)
+        return changed(self, landmarks=landmarks, covariance=covariance)
 
     # --- landmarks join and leave ---
 
@@ -112,7 +109,7 @@ class FilterState:
         D, J = new.gauge[:, :, :3] @ R, new.gauge @ displacement(self.camera)
         moved = J @ self.covariance.by_rig[:POSE] + (0.0 if by_rig is None else D @ by_rig)
         noise = _block_diagonal(D @ covariances @ D.transpose(0, 2, 1))
-        return replace(self, measured=True)._with(new, self.covariance.appended(J, noise, moved))
+        return changed(self, measured=True)._with(new, self.covariance.appended(J, noise, moved))
 
     def inserted(self, new: FilterLandmarks, covariances: Array) -> FilterState:
         """With landmarks known from elsewhere, by covariances (M, 3, 3) of their coordinates."""
@@ -152,32 +149,28 @@ class FilterState:
         last = self.landmarks.last[may]
         oldest = np.argsort(last, kind="stable")[: len(may) - most + most // _AT_ONCE]
         rows = np.sort(may[oldest[last[oldest] < self.frame]])
-        since, covariance = np.tile(self.travelled_now(), (len(rows), 1, 1)), self.covariance
-        left = Apart(covariance.marginals(rows)[0], self.from_camera(rows), since, covariance.landmarks_by_rig(rows))
+        if not len(rows):
+            return self
+        since, (own, _, by_rig) = np.tile(self.travelled_now(), (len(rows), 1, 1)), self.covariance.marginals(rows)
+        left = Apart(own, self.from_camera(rows), since, by_rig)
         return self._without(rows)._with_apart(self.landmarks.select(rows), left)
-
-    def _state(self) -> slice:
-        """Rows of the landmarks that are in the state."""
-        return slice(self.covariance.correlated)
 
     def _without(self, gone: IndexArray) -> FilterState:
         """Without the landmarks of some rows of the table."""
         stays, count = np.delete(np.arange(len(self.landmarks)), gone), self.covariance.correlated
         covariance = self.covariance.only(stays[stays < count], stays[stays >= count])
-        return replace(self, landmarks=self.landmarks.select(stays), covariance=covariance)
+        return changed(self, landmarks=self.landmarks.select(stays), covariance=covariance)
 
     def _with(self, new: FilterLandmarks, covariance: Covariance) -> FilterState:
         """With new landmarks, the last ones of the state."""
-        state, apart = (
-            self.landmarks.select(self._state()),
-            self.landmarks.select(slice(self.covariance.correlated, None)),
-        )
-        return replace(self, landmarks=state.joined(new).joined(apart), covariance=covariance)
+        end, marks = self.covariance.correlated, self.landmarks
+        landmarks = marks.select(slice(end)).joined(new).joined(marks.select(slice(end, None)))
+        return changed(self, landmarks=landmarks, covariance=covariance)
 
     def _with_apart(self, new: FilterLandmarks, what: Apart) -> FilterState:
         """With new landmarks that are apart."""
-        covariance = replace(self.covariance, apart=self.covariance.apart.joined(what))
-        return replace(self, landmarks=self.landmarks.joined(new), covariance=covariance)
+        covariance = changed(self.covariance, apart=self.covariance.apart.joined(what))
+        return changed(self, landmarks=self.landmarks.joined(new), covariance=covariance)
 
     # --- updates ---
 
@@ -192,7 +185,8 @@ class FilterState:
         and Bonnabel, 2015). Raises LinAlgError where the new state is not finite, or a variance is lost in rounding.
         """
         update, camera = found.at.update, found.camera
-        marks = self.landmarks.moved(update.coordinates, self._state(), found.change[HEAD:].reshape(-1, 3))
+        change = found.change[HEAD:].reshape(-1, 3)
+        marks = self.landmarks.moved(update.coordinates, slice(len(change)), change)
         marks.last[update.rows[found.used]] = self.frame
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise LinAlgError("the corrected state is not finite")
@@ -200,7 +194,7 @@ class FilterState:
         covariance = update.covariance.corrected(*found.gain(), J, shift)
         if not (covariance.P.diagonal()[HEAD:] > 0).all():
             raise LinAlgError("a landmark's variance would not stay positive")
-        return replace(self, camera=camera, landmarks=marks, covariance=covariance)
+        return changed(self, camera=camera, landmarks=marks, covariance=covariance)
 
     def displaced(self, coordinates: Coordinates, ids: IdArray, points: Array) -> FilterState:
         """With some landmarks at points (M, 3) [m]: their error stays, and the covariance is transported as above.
@@ -212,11 +206,11 @@ class FilterState:
         if not np.isfinite(marks.points).all():
             return self
         covariance = self.covariance.displaced(rows, (marks.c - before.c)[rows], self._shift(marks, self.camera))
-        return replace(self, landmarks=marks, covariance=covariance)
+        return changed(self, landmarks=marks, covariance=covariance)
 
     def _shift(self, marks: FilterLandmarks, camera: Camera) -> Array:
         """What is added to the errors (N, 3, 6) of landmarks that have moved, by the error of the pose."""
-        change = (marks.gauge - self.landmarks.gauge)[self._state()]
+        change = (marks.gauge - self.landmarks.gauge)[: self.covariance.correlated]
         return np.asarray(change @ displacement(camera) if camera.transports else np.zeros_like(change))
 
 
