@@ -122,19 +122,17 @@ class FilterState:
     def with_all_of(self, ids: IdArray) -> FilterState:
         """With some landmarks (M,), which may be apart, in the state.
 
-        Those that left together are as uncertain together by the camera's way since. Those of a prior map are
-        independent of the pose in the world.
+        Those that have left share the uncertainty of the camera's way since the later of two left. Those of a prior map
+        are independent of the pose in the world.
         """
         rows = self.landmarks.rows_of(ids)
-        rows = np.sort(rows[rows >= self.covariance.correlated])
+        rows = np.sort(rows[rows >= self.covariance.correlated])  # in the order in which they left
         if not len(rows):
             return self
         apart, new = self.covariance.apart.select(rows - self.covariance.correlated), self.landmarks.select(rows)
         G = np.where(new.known[:, None, None], 0.0, new.gauge)
-        moved = G @ (self.travelled_now() - apart.since)
-        together = apart.since[:, 0, 0, None] == apart.since[:, 0, 0]
-        way = (moved[:, None] @ G.transpose(0, 2, 1)) * together[:, :, None, None]
-        noise = _block_diagonal(apart.seen) + way.transpose(0, 2, 1, 3).reshape(3 * len(rows), -1)
+        way = (G @ (self.travelled_now() - apart.since)).reshape(-1, POSE) @ G.reshape(-1, POSE).T
+        noise = _block_diagonal(apart.seen) + np.tril(way) + np.tril(way, -1).T
         s = self._without(rows)
         return s._with(new, s.covariance.appended(G @ displacement(self.camera), noise, apart.by_rig))
 
