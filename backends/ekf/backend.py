@@ -44,7 +44,7 @@ class EkfConfig:
     measurement: str = "stereo"
     iterations: int = 20
     landmarks: str = "inverse_depth"
-    kept: int | None = 150
+    kept: int | None = 200
     consistent: bool = True
 
     def __post_init__(self) -> None:

@@ -91,7 +91,7 @@ class IekfConfig:
     """
 
     iterations: int = 20
-    kept: int | None = 150
+    kept: int | None = 200
 
     def __post_init__(self) -> None:
         require_not_negative(self, {"iterations": (1, 1000), "kept": (0, 10**6)}, "iekf")
