@@ -115,7 +115,7 @@ class Covariance:
         F = np.eye(HEAD) if by_error is None else np.eye(HEAD, k=-POSE)
         F[:CAMERA, :CAMERA] = J
         if by_error is not None:
-            F[CAMERA : CAMERA + POSE, :CAMERA] = np.pad(by_error, ((0, 0), (0, POSE)))
+            F[CAMERA : CAMERA + POSE, :POSE], F[CAMERA : CAMERA + POSE, POSE:CAMERA] = by_error, 0.0
         P, by_rig = self.P.copy(), self.by_rig.copy()
         P[:HEAD], by_rig[:HEAD] = F @ P[:HEAD], F @ by_rig[:HEAD]
         own = P[:HEAD, :HEAD] @ F.T

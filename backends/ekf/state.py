@@ -62,9 +62,8 @@ class FilterState:
         """At a later time, after a motion of the camera."""
         camera, J, noise = motion
         covariance = self.covariance.camera_moved(J, noise, pose_by_error(self.camera))
-        return FilterState(
-            stamp, self.frame + 1, False, camera, self.landmarks, covariance, self.pose, self.travelled_now()
-        )  # fmt: skip
+        travelled = self.travelled_now() if len(covariance.apart) else self.travelled  # it is counted once one has left
+        return FilterState(stamp, self.frame + 1, False, camera, self.landmarks, covariance, self.pose, travelled)
 
     def travelled_now(self) -> Array:
         """What the camera has travelled by now (6, 6)."""
