@@ -8,7 +8,7 @@ In the papers' order:
 - `innovation`: measurement, ν and S (A, Eqs. 5-7; B, Eqs. 1-5); `solve`: gate, the update of the mean (A, Eq. 11), and
   what else is tried where it fails.
 - `covariance`: ``A P Aᵀ + W Q Wᵀ`` (B, section 2), landmarks that join (A, Eq. 10), ``P − K S Kᵀ`` (A, Eq. 11).
-- `state`: camera, landmarks and covariance, and the steps from one such state to the next.
+- `state`: camera, landmarks and covariance, the steps from one such state to the next, and which landmarks leave.
 - `filter`: a back end for any camera; `backend`: the papers'.
 """
 

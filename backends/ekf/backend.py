@@ -21,14 +21,18 @@ class EkfConfig:
     """Options of `EkfBackend`.
 
     Attributes:
-        papers: closest to the papers' filter: the left pixel alone, one linearisation, landmarks in the world, a
-            covariance that is not transported, features that do not slide. No other option may be set then. What stays
-            is the outlier test with readmission, the recovery, what a long gap does, and the angles' own world.
+        papers: closest to the papers' filter: the left pixel alone, one linearisation, landmarks in the world, all of
+            them in the state, a covariance that is not transported, features that do not slide. No other option may be
+            set then. What stays is the outlier test with readmission, the recovery, what a long gap does, and the
+            angles' own world.
         measurement: ``"stereo"`` measures (uL, vL, uR), ``"left"`` the left pixel alone, as the papers do (paper A, V).
         iterations: most linearisations in an update; 1 is the papers' filter (paper A, Eq. 11). More are made only in
             updates where the first is not linear to within the noise.
         landmarks: coordinates of a landmark in the state: ``"inverse_depth"`` by the camera that saw it first, or
             ``"euclidean"`` in the world, as the papers do. See `backends.ekf.landmarks`.
+        kept: most landmarks that keep their covariance with the camera and each other, besides those of a prior map; of
+            others, those that were measured longest ago leave the state. Null (in Python None) keeps all, as the papers
+            do. See `backends.ekf.state.FilterState`.
         consistent: keep the unobservable pose of the whole map (where the world's origin is and which way it faces)
             from seeming to be measured: the covariance is transported to the corrected state after each update.
 
@@ -40,10 +44,11 @@ class EkfConfig:
     measurement: str = "stereo"
     iterations: int = 20
     landmarks: str = "inverse_depth"
+    kept: int | None = 200
     consistent: bool = True
 
     def __post_init__(self) -> None:
-        require_not_negative(self, {"iterations": (1, 1000)}, "ekf")
+        require_not_negative(self, {"iterations": (1, 1000), "kept": (0, 10**6)}, "ekf")
         if self.papers and replace(self, papers=False) != EkfConfig():
             raise ConfigurationError("ekf: papers=true chooses the other options itself; leave them out")
         for name, known in (("measurement", MEASUREMENTS), ("landmarks", tuple(COORDINATES))):
@@ -77,7 +82,8 @@ class EkfBackend(LandmarkFilter):
         self.config = from_options(EkfConfig, "ekf", options)
         use = self.config
         if use.papers:
-            use = EkfConfig(measurement="left", iterations=1, landmarks="euclidean", consistent=False)
+            use = EkfConfig(measurement="left", iterations=1, landmarks="euclidean", kept=None, consistent=False)
             models = replace(models, slide=SlideModel())
         first = EulerCamera.first(models, use.consistent)
-        super().__init__(rig, models, first, COORDINATES[use.landmarks], use.iterations, use.measurement == "stereo")
+        stereo = use.measurement == "stereo"
+        super().__init__(rig, models, first, COORDINATES[use.landmarks], use.iterations, use.kept, stereo)

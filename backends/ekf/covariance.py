@@ -3,7 +3,8 @@
 The last poses are corrected no more: they stay as they were believed in their time (stochastic clones). Their errors'
 covariance with the others goes on, as in the filter of Schmidt, which is exact for what it does: with a gain of zero
 ``P_ab ← (1 − K H) P_ab`` and ``P_bb`` stays.
-What is known of a landmark from elsewhere is independent of all else until it is measured: nothing need be carried.
+Landmarks that are independent of all else until they are measured are apart from the matrix: those that are known from
+elsewhere, and those that were measured so long ago that they have left it.
 
 Errors of the rig (`slam.interfaces.ConsideringBackend`) are considered, too, but not estimated. What is kept are the
 derivatives of all errors by them, which the same gain moves: a landmark's measurement is off by ``H x − F δ``, with a
@@ -12,12 +13,13 @@ field F. Their own covariance is not needed here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg.blas import dsyr2k, dsyrk
 
 from slam.data import IndexArray
+from slam.geometry.arrays import Table, changed
 from slam.geometry.se3 import Array
 from slam.runtime.compilation import kernel
 
@@ -29,26 +31,42 @@ _BLOCK = 32  # cost: rows and columns that are mirrored at once
 
 
 @dataclass(frozen=True, eq=False)
+class Apart(Table):
+    """What is known of the coordinates of landmarks (C,) that are independent of all else."""
+
+    own: Array  # covariances (C, 3, 3)
+    seen: Array  # of those that have left, covariances (C, 3, 3) of the error as seen from the camera of that time
+    since: Array  # and what that had travelled (C, 6, 6); see `backends.ekf.state.FilterState`
+    by_rig: Array  # derivatives (C, 3, m) by errors of the rig
+
+    @classmethod
+    def known(cls, own: Array, m: int) -> Apart:
+        """Landmarks that are known from elsewhere."""
+        return cls(own, own, np.zeros((len(own), POSE, POSE)), np.zeros((len(own), 3, m)))
+
+
+@dataclass(frozen=True, eq=False)
 class Covariance:
     """Of ``[camera (12), last poses (24), N landmarks (3N)]``, n numbers.
 
     The poses are perturbed on the right, the newest first; zero before there are so many. Rows of the table of
-    landmarks are in this order; behind them are those that are known from elsewhere.
+    landmarks are in this order; behind them are those that are apart.
     """
 
     P: Array  # (n, n)
     by_rig: Array  # derivatives (n, m) of all errors by those of the rig
-    known: Array  # (C, 3, 3), of each landmark that is independent of all else
+    apart: Apart
 
     @classmethod
     def of_camera(cls, P: Array, by_rig: Array | None = None) -> Covariance:
         """Of the camera alone (12, 12), with derivatives (12, m) of its error by errors of the rig."""
         by_rig, more = np.zeros((CAMERA, 0)) if by_rig is None else by_rig, (0, HEAD - CAMERA)
-        return cls(np.pad(P, more), np.pad(by_rig, (more, (0, 0))), np.zeros((0, 3, 3)))
+        none = Apart.known(np.zeros((0, 3, 3)), by_rig.shape[1])
+        return cls(np.pad(P, more), np.pad(by_rig, (more, (0, 0))), none)
 
     @property
     def correlated(self) -> int:
-        """N: the landmarks after these are known from elsewhere."""
+        """N: the landmarks after these are apart."""
         return (len(self.P) - HEAD) // 3
 
     @property
@@ -65,19 +83,18 @@ class Covariance:
         """Where the coordinates (M, 3) of landmarks stand, by rows of the table."""
         return np.asarray(HEAD + 3 * rows[:, None] + np.arange(3))
 
-    def marginals(self, rows: IndexArray) -> tuple[Array, Array]:
-        """Covariances (M, 3, 3) of landmarks, and theirs (M, 3, 6) with the camera's [r, φ]; by rows of the table."""
-        blocks, with_pose, known = np.empty((len(rows), 3, 3)), np.zeros((len(rows), 3, POSE)), rows >= self.correlated
-        at = self.numbers(rows[~known])
-        blocks[~known], with_pose[~known] = self.P[at[:, :, None], at[:, None, :]], self.P[at, :POSE]
-        blocks[known] = self.known[rows[known] - self.correlated]
-        return blocks, with_pose
+    def marginals(self, rows: IndexArray) -> tuple[Array, Array, Array]:
+        """Of landmarks, by rows of the table: covariances (M, 3, 3), also (M, 3, 6) with the camera's [r, φ], `by_rig`.
 
-    def landmarks_by_rig(self, rows: IndexArray) -> Array:
-        """Derivatives (M, 3, m) of some landmarks by errors of the rig."""
-        out, there = np.zeros((len(rows), 3, self.by_rig.shape[1])), rows < self.correlated
-        out[there] = self.by_rig[self.numbers(rows[there])]
-        return out
+        The last are derivatives (M, 3, m) by errors of the rig.
+        """
+        there, M = rows < self.correlated, len(rows)
+        at, apart = self.numbers(rows[there]), self.apart.select(rows[~there] - self.correlated)
+        own, with_pose, by_rig = np.empty((M, 3, 3)), np.zeros((M, 3, POSE)), np.empty((M, 3, self.by_rig.shape[1]))
+        own[there], own[~there] = self.P[at[:, :, None], at[:, None, :]], apart.own
+        by_rig[there], by_rig[~there] = self.by_rig[at], apart.by_rig
+        with_pose[there] = self.P[at, :POSE]
+        return own, with_pose, by_rig
 
     def joint_poses(self, J: Array, n: int) -> Array:
         """Joint covariance (6n, 6n) of the last poses, the present one, J (6, 6) times [r, φ], last."""
@@ -98,46 +115,40 @@ class Covariance:
         F = np.eye(HEAD) if by_error is None else np.eye(HEAD, k=-POSE)
         F[:CAMERA, :CAMERA] = J
         if by_error is not None:
-            F[CAMERA : CAMERA + POSE, :CAMERA] = np.pad(by_error, ((0, 0), (0, POSE)))
+            F[CAMERA : CAMERA + POSE, :POSE], F[CAMERA : CAMERA + POSE, POSE:CAMERA] = by_error, 0.0
         P, by_rig = self.P.copy(), self.by_rig.copy()
         P[:HEAD], by_rig[:HEAD] = F @ P[:HEAD], F @ by_rig[:HEAD]
         own = P[:HEAD, :HEAD] @ F.T
         own[:CAMERA, :CAMERA] += noise
         P[:HEAD, :HEAD] = 0.5 * (own + own.T)
         P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
-        return replace(self, P=P, by_rig=by_rig)
+        return changed(self, P=P, by_rig=by_rig)
 
     def walked(self, rows: IndexArray, walk: Array) -> Covariance:
-        """After landmarks (`rows` (M,) of the table, none of those known from elsewhere) walk by (M, 3, 3)."""
+        """After landmarks (`rows` (M,) of the table, none of those that are apart) walk by (M, 3, 3)."""
         P, at = self.P.copy(), self.numbers(rows)
         P[at[:, :, None], at[:, None, :]] += walk
-        return replace(self, P=P)
+        return changed(self, P=P)
 
     # --- landmarks join and leave ---
 
     def appended(self, J: Array, noise: Array, by_rig: Array) -> Covariance:
-        """With landmarks ``Y = g(r, φ) + noise`` (paper A, Eq. 10), by derivatives (M, 3, 6) and covariances (M, 3, 3).
+        """With landmarks ``Y = g(r, φ) + noise`` (paper A, Eq. 10), by derivatives (M, 3, 6) and a covariance (3M, 3M).
 
-        They are the last ones. With the pose known, errors of the rig move them by `by_rig` (M, 3, m).
+        They are the last ones. Errors of the rig move them by `by_rig` (M, 3, m).
         """
-        n, each, by_pose = len(self.P), np.arange(len(J)), J.reshape(-1, POSE)
+        n, by_pose = len(self.P), J.reshape(-1, POSE)
         P, cross = np.empty((n + len(by_pose),) * 2), by_pose @ self.P[:POSE]
         P[:n, :n], P[n:, :n], P[:n, n:] = self.P, cross, cross.T
-        own = cross[:, :POSE] @ by_pose.T
-        own.reshape(len(J), 3, len(J), 3)[each, :, each] += noise
+        own = cross[:, :POSE] @ by_pose.T + noise
         P[n:, n:] = positive(0.5 * (own + own.T), own.diagonal(), POSE)
-        moved = by_pose @ self.by_rig[:POSE] + by_rig.reshape(len(by_pose), -1)
-        return replace(self, P=P, by_rig=np.concatenate([self.by_rig, moved]))
+        return changed(self, P=P, by_rig=np.concatenate([self.by_rig, by_rig.reshape(len(by_pose), -1)]))
 
-    def rearranged(self, rows: IndexArray, known: IndexArray) -> Covariance:
-        """With other landmarks in each of its two parts, or fewer; by their rows of the table of landmarks."""
-        joining = np.flatnonzero(rows >= self.correlated)
-        numbers, at = np.append(np.arange(HEAD), self.numbers(rows)), self.numbers(joining)
-        numbers[at] = -1
-        P, by_rig = reordered(self.P, numbers), self.by_rig[numbers]
-        by_rig[at] = 0.0
-        P[at[:, :, None], at[:, None, :]] = self.known[rows[joining] - self.correlated]
-        return replace(self, P=P, by_rig=by_rig, known=self.known[known - self.correlated])
+    def only(self, rows: IndexArray, apart: IndexArray) -> Covariance:
+        """With these landmarks alone, in each of its two parts; by their rows of the table of landmarks."""
+        numbers = np.append(np.arange(HEAD), self.numbers(rows))
+        kept = self.apart.select(apart - self.correlated)
+        return Covariance(reordered(self.P, numbers), self.by_rig[numbers], kept)
 
     # --- an update ---
 
@@ -164,17 +175,19 @@ class Covariance:
         summands = self.P.diagonal() + 2 * (half * D).sum(axis=1)
         summands[last] = 0.0
         mirror(P, len(P))
-        return replace(self, P=positive(P, summands, V.shape[1]), by_rig=by_rig)
+        return changed(self, P=positive(P, summands, V.shape[1]), by_rig=by_rig)
 
     def displaced(self, rows: IndexArray, change: Array, shift: Array) -> Covariance:
         """After a change (M, 3) of some landmarks' coordinates that is none of their error, with a shift as above.
 
         It is that of the last of the rig's errors, which is known to be 1 (`slam.interfaces.ConsideringBackend`).
         """
-        by_rig = self.by_rig.copy()
-        by_rig[self.numbers(rows).ravel(), -1:] -= change.reshape(-1, 1)
+        by_rig, apart, there = self.by_rig.copy(), self.apart.by_rig.copy(), rows < self.correlated
+        by_rig[self.numbers(rows[there]), -1:] -= change[there, :, None]
+        apart[rows[~there] - self.correlated, :, -1:] -= change[~there, :, None]
+        moved = changed(self, by_rig=by_rig, apart=changed(self.apart, by_rig=apart))
         nothing = np.zeros((len(self.P), 0))
-        return replace(self, by_rig=by_rig).corrected(nothing, 0 * by_rig, np.eye(CAMERA), shift)
+        return moved.corrected(nothing, 0 * by_rig, np.eye(CAMERA), shift)
 
 
 @kernel
@@ -189,12 +202,11 @@ def mirror(P: Array, n: int) -> None:
 
 @kernel
 def reordered(P: Array, order: IndexArray) -> Array:
-    """P (n, n) with its rows and columns in an order (k,); those of a negative number are zero."""
-    out = np.zeros((len(order), len(order)))
+    """P (n, n) with its rows and columns in an order (k,)."""
+    out = np.empty((len(order), len(order)))
     for i in range(len(order)):
-        for j in range(len(order) if order[i] >= 0 else 0):
-            if order[j] >= 0:
-                out[i, j] = P[order[i], order[j]]
+        for j in range(len(order)):
+            out[i, j] = P[order[i], order[j]]
     return out
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from backends.ekf.camera import Camera, Motion, displacement, from_body_axes, pose_by_error, predicted, prior
+from backends.ekf.camera import Camera, Motion, from_body_axes, pose_by_error, predicted, prior
 from backends.ekf.covariance import CAMERA, POSE, RECENT, Covariance, positive
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
@@ -18,6 +17,7 @@ from slam.checks import known_landmarks, require_guess, require_not_measured, re
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
+from slam.geometry.arrays import changed
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
@@ -41,6 +41,7 @@ class LandmarkFilter:
         camera: the first one, in its prior.
         coordinates: of the landmarks.
         iterations: most linearisations of an update.
+        kept: most landmarks that keep their covariance with the camera; see `FilterState`. None: all.
         stereo: whether the right pixel is measured.
 
     Attributes:
@@ -54,11 +55,11 @@ class LandmarkFilter:
 
     def __init__(
         self, rig: StereoRig, models: EstimatorModels, camera: Camera, coordinates: Coordinates, iterations: int,
-        stereo: bool = True, /,
+        kept: int | None, stereo: bool = True, /,
     ) -> None:  # fmt: skip
         # by position alone: they are no options of a back end
         self.rig, self.models = rig, models
-        self._coordinates, self._iterations, self._stereo = coordinates, iterations, stereo
+        self._coordinates, self._iterations, self._kept, self._stereo = coordinates, iterations, kept, stereo
         self._measure = RectifiedMeasurement(rig, models.with_slide())
         self._slide = Slide.of(models, self._measure.stereo.f)
         self.state = FilterState.first(camera, from_body_axes(camera, prior(models)))
@@ -82,7 +83,7 @@ class LandmarkFilter:
         s = self._started("update")
         require_not_measured(self.name, s.measured)
         require_guess(self.name, guess)
-        s = replace(s.with_all_of(observations.ids), measured=True)
+        s = changed(s.with_all_of(observations.ids), measured=True)
         s, report = self._updated(s, observations, guess)
         self.state = s
         return report
@@ -143,8 +144,8 @@ class LandmarkFilter:
         anchors[:, :, 3] = positions
         deviations = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         anchors[:, 2, 3] -= np.clip(_STAND_OFF * deviations, 1.0, _FARTHEST_ANCHOR)
-        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions)
-        new = replace(new, sights=np.full((len(ids), 3), np.nan))
+        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, -1)
+        new = changed(new, sights=np.full((len(ids), 3), np.nan), known=np.ones(len(ids), bool))
         D = new.gauge[:, :, :3]
         self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
 
@@ -165,15 +166,15 @@ class LandmarkFilter:
         by_rig = np.zeros((CAMERA, m))
         if pose is not None:
             by_rig[:POSE] = np.linalg.solve(pose_by_error(s.camera), pose)
-        self._measure = replace(self._measure, field=field)
-        self.state = replace(s, covariance=Covariance.of_camera(s.covariance.camera, by_rig))
+        self._measure = changed(self._measure, field=field)
+        self.state = changed(s, covariance=Covariance.of_camera(s.covariance.camera, by_rig))
 
     def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
         """See `slam.interfaces.ConsideringBackend.sensitivities`."""
         s = self._started("sensitivities")
         rows = s.landmarks.rows_of(ids)
         D = self._coordinates.jacobian(s.landmarks.anchors[rows], s.landmarks.c[rows])
-        return pose_by_error(s.camera) @ s.covariance.by_rig[:POSE], D @ s.covariance.landmarks_by_rig(rows)
+        return pose_by_error(s.camera) @ s.covariance.by_rig[:POSE], D @ s.covariance.marginals(rows)[2]
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
@@ -187,9 +188,10 @@ class LandmarkFilter:
         are now, would look as if the camera had moved. Those of a prior map that were not measured yet were placed by
         no pixels: they stay.
         """
-        s, stereo = replace(self.state, measured=True), self._measure.stereo
+        s, stereo = changed(self.state, measured=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
-            marks = s.landmarks.select(slice(s.covariance.correlated))
+            rows = np.arange(len(s.landmarks))
+            marks = s.landmarks.select(~s.landmarks.known | (rows < s.covariance.correlated))
             z, _ = stereo.project(se3.transform(se3.inverse(s.pose), marks.points))
             T = np.where(self.rig.left.in_image(z[:, :2])[:, None, None], s.pose[:3], marks.anchors)
             z, _ = stereo.project(((marks.points - T[:, :, 3])[:, None] @ T[:, :, :3])[:, 0])
@@ -211,7 +213,7 @@ class LandmarkFilter:
 
     def _moved_on(self, stamp: float, rests: bool) -> Prediction:
         """Go to a time, and say what is in the angle of view then; whether the camera rests meanwhile."""
-        s = self.state
+        s = self.state if self._kept is None else self.state.with_most(self._kept)
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
         motion: Motion = s.camera, np.eye(CAMERA), np.zeros((CAMERA, CAMERA))
         if s.frame >= 0:
@@ -219,12 +221,9 @@ class LandmarkFilter:
         T = motion[0].pose
         rows = self._measure.visible(T, s.landmarks.points)
         after = s.advanced(float(stamp), motion)
-        marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
-        blocks += self._slide.walked(after.landmarks, rows, T[:3, 3])[1]
+        marks, walk = after.landmarks.select(rows), self._slide.walked(after.landmarks, rows, T[:3, 3])[1]
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
-        by_pose = -toward @ (marks.gauge @ displacement(after.camera))  # (M, 3, 6), of them as seen from the camera
-        local = (by_pose @ after.covariance.pose + 2 * toward @ cross) @ by_pose.transpose(0, 2, 1)
-        local = 0.5 * (local + local.transpose(0, 2, 1)) + toward @ blocks @ toward.transpose(0, 2, 1)
+        local = toward @ (after.from_camera(rows) + walk) @ toward.transpose(0, 2, 1)
         left, right, S = self._measure.pixels((marks.points - T[:3, 3]) @ T[:3, :3], local)
         prediction = Prediction(after.stamp, T.copy(), after.pose_covariance(), marks.ids, left, right, S)
         self._past[after.frame - 1 :] = [(s.stamp, s.pose)] if after.frame else []

@@ -8,7 +8,7 @@ keeps its row with a zero Jacobian and a zero innovation: it adds nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +19,7 @@ from backends.ekf.camera import Camera, displacement, transport
 from backends.ekf.covariance import CAMERA, HEAD, POSE, Covariance, reordered
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.data import BoolArray, IndexArray
+from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array
 from slam.window.gating import squared_distances
 from slam.window.solver import upper_inverse
@@ -48,7 +49,7 @@ class Update:
         camera, J = self.camera.regular_towards(T)
         if camera is self.camera:
             return self
-        return replace(self, camera=camera, covariance=self.covariance.camera_moved(J, np.zeros((CAMERA, CAMERA))))
+        return changed(self, camera=camera, covariance=self.covariance.camera_moved(J, np.zeros((CAMERA, CAMERA))))
 
     @cached_property
     def numbers(self) -> IndexArray:
@@ -214,10 +215,14 @@ class Correction:
         return self.at.camera.moved(self.at.J @ (self.change - self.at.change)[:CAMERA])
 
     @cached_property
+    def white_pose(self) -> Array:
+        """``L_aa⁻¹ (H P)_a`` of the pose (3K, 6)."""
+        return self.white(self.at.HP[:, :POSE])
+
+    @cached_property
     def pose_covariance(self) -> Array:
         """Of the error [r, φ] (6, 6) after the update, in the prior's coordinates."""
-        white = self.white(self.at.HP[:, :POSE])
-        return np.asarray(self.at.update.covariance.pose - white.T @ white)
+        return np.asarray(self.at.update.covariance.pose - self.white_pose.T @ self.white_pose)
 
     def gain(self) -> tuple[Array, Array]:
         """V (n, 3K) with ``V Vᵀ = K S Kᵀ``; and what errors of the rig change in the gain's errors.

@@ -10,12 +10,12 @@ state has three numbers a landmark as before and everything else stays as it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from slam.data import IdArray, IndexArray
-from slam.geometry.arrays import LandmarkRows
+from slam.data import BoolArray, IdArray, IndexArray
+from slam.geometry.arrays import LandmarkRows, changed
 from slam.geometry.se3 import Array, hat
 from slam.models import EstimatorModels
 
@@ -104,26 +104,30 @@ class FilterLandmarks(LandmarkRows):
     points: Array  # positions (N, 3) [m] in the world, which follow from the two
     gauge: Array  # derivatives (N, 3, 6) of the coordinates by one of the world [shift, turn about its origin]
     sights: Array  # lines of sight (N, 3) up to which the slide is counted, in the world; NaN where that is not known
+    last: IndexArray  # number of the frame that measured it last (N,)
+    known: BoolArray  # of a prior map (N,)
 
     @classmethod
-    def at(cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array) -> FilterLandmarks:
-        """New ones at positions (M, 3), seen from their anchors."""
+    def at(cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array, frame: int) -> FilterLandmarks:
+        """New ones at positions (M, 3), seen from their anchors in a frame of that number."""
         c = coordinates.of(anchors, points)
         gauge, sights = gauge_jacobian(coordinates, anchors, c, points), points - anchors[:, :, 3]
-        return cls(ids, anchors, c, points, gauge, sights / np.linalg.norm(sights, axis=1, keepdims=True))
+        sights /= np.linalg.norm(sights, axis=1, keepdims=True)
+        return cls(ids, anchors, c, points, gauge, sights, np.full(len(ids), frame), np.zeros(len(ids), bool))
 
     @classmethod
     def none(cls) -> FilterLandmarks:
         """No landmarks."""
-        return cls.at(Euclidean(), np.zeros(0, np.int64), np.zeros((0, 3, 4)), np.zeros((0, 3)))
+        return cls.at(Euclidean(), np.zeros(0, np.int64), np.zeros((0, 3, 4)), np.zeros((0, 3)), -1)
 
     def moved(self, coordinates: Coordinates, rows: IndexArray | slice, change: Array) -> FilterLandmarks:
         """With a change (M, 3) of the coordinates of some rows."""
-        c, points, gauge, anchors = self.c.copy(), self.points.copy(), self.gauge.copy(), self.anchors[rows]
+        c, points, gauge, last = self.c.copy(), self.points.copy(), self.gauge.copy(), self.last.copy()
+        anchors = self.anchors[rows]
         c[rows] = coordinates.moved(self.c[rows], change)
         points[rows] = coordinates.points(anchors, c[rows])
         gauge[rows] = gauge_jacobian(coordinates, anchors, c[rows], points[rows])
-        return replace(self, c=c, points=points, gauge=gauge)
+        return changed(self, c=c, points=points, gauge=gauge, last=last)
 
 
 @dataclass(frozen=True)
@@ -156,7 +160,7 @@ class Slide:
         sights[rows[walk]] = (sight / distance)[walk]
         across = (distance**2)[:, :, None] * np.eye(3) - sight[:, :, None] * sight[:, None, :]
         noise = (self.density**2 * np.where(walk, angle, 0.0))[:, None, None] * (D @ across @ D.transpose(0, 2, 1))
-        return replace(marks, sights=sights), noise
+        return changed(marks, sights=sights), noise
 
 
 def gauge_jacobian(coordinates: Coordinates, anchors: Array, c: Array, points: Array) -> Array:

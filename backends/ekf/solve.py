@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -28,6 +28,7 @@ from backends.ekf.covariance import CAMERA, HEAD, POSE
 from backends.ekf.innovation import Correction, Linearisation, Update, diagonal_blocks
 from slam.data import BoolArray
 from slam.geometry import se3
+from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array
 from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, by_chance, squared_distances
 from slam.window.recovery import Search
@@ -84,7 +85,7 @@ def _restarted(update: Update, search: Search, least: int) -> Correction | None:
     before, there = update.camera.pose, update.regular_towards(T)
     far, turned = np.linalg.norm(T[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ T[:3, :3])
     noise = from_body_axes(there.camera, prior(update.measure.models, (float(far), float(turned))))
-    there = replace(there, covariance=there.covariance.camera_moved(np.eye(CAMERA), noise))
+    there = changed(there, covariance=there.covariance.camera_moved(np.eye(CAMERA), noise))
     with suppress(LinAlgError):
         found = gated_correction(gate(there, T))
         return found if found is not None and found.used.sum() >= least else None
@@ -178,7 +179,7 @@ def _iterate(at: Linearisation, used: BoolArray) -> Correction:
         if update.iterations == 1 or _linear(found):
             return found
     assert found is not None  # there is one iteration at least
-    return replace(found, linear=False)
+    return changed(found, linear=False)
 
 
 def _linear(found: Correction) -> bool:
@@ -190,5 +191,5 @@ def _linear(found: Correction) -> bool:
     errors = np.where(now.seen & found.used[:, None], errors, 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
-    shift = found.white(errors.reshape(-1)) @ found.white(now.HP[:, :POSE])
+    shift = found.white(errors.reshape(-1)) @ found.white_pose
     return bool((shift**2 <= _POSE_SHARE**2 * found.pose_covariance.diagonal()).all())

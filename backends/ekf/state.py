@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.linalg import LinAlgError
 
 from backends.ekf.camera import Camera, Motion, displacement, pose_by_error, transport
-from backends.ekf.covariance import HEAD, Covariance
+from backends.ekf.covariance import HEAD, POSE, Apart, Covariance
 from backends.ekf.innovation import Correction
 from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
 from slam.data import IdArray, IndexArray
+from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array
+from slam.window.stereo import relative_covariance
+
+_AT_ONCE = 8  # cost: one of so many landmarks leaves at once, so that the matrix is not copied in every frame
 
 
 @dataclass(frozen=True, eq=False)
 class FilterState:
-    """A camera and three coordinates per landmark, with the joint covariance of their errors."""
+    """A camera and three coordinates per landmark, with the joint covariance of their errors.
+
+    Landmarks that were measured long ago leave the matrix. They stay in the map, where they were, with their covariance
+    in the world. As seen from the camera, they are as uncertain as when they left, and by its way since: what it has
+    travelled is the sum over its steps of their covariances, as if they were independent, each as a displacement of the
+    world. So are they predicted, and so do those that are measured again join, as new ones would: independent of the
+    pose as seen from the camera. They tell it nothing of the past, and nothing is counted twice.
+    """
 
     stamp: float  # time [s]; NaN before the first prediction
     frame: int  # number of the prediction, −1 before the first
@@ -25,11 +36,14 @@ class FilterState:
     camera: Camera
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of everything
+    before: Array  # the pose (4, 4) of the prediction before
+    travelled: Array  # what the camera had travelled then (6, 6)
 
     @classmethod
     def first(cls, camera: Camera, P: Array) -> FilterState:
         """Before the first prediction, with the covariance (12, 12) of the camera's error."""
-        return cls(float("nan"), -1, True, camera, FilterLandmarks.none(), Covariance.of_camera(P))
+        covariance, still = Covariance.of_camera(P), np.zeros((POSE, POSE))
+        return cls(float("nan"), -1, True, camera, FilterLandmarks.none(), covariance, camera.pose, still)
 
     # --- the camera ---
 
@@ -48,13 +62,34 @@ class FilterState:
         """At a later time, after a motion of the camera."""
         camera, J, noise = motion
         covariance = self.covariance.camera_moved(J, noise, pose_by_error(self.camera))
-        return FilterState(stamp, self.frame + 1, False, camera, self.landmarks, covariance)
+        travelled = self.travelled_now() if len(covariance.apart) else self.travelled  # it is counted once one has left
+        return FilterState(stamp, self.frame + 1, False, camera, self.landmarks, covariance, self.pose, travelled)
+
+    def travelled_now(self) -> Array:
+        """What the camera has travelled by now (6, 6)."""
+        if self.frame < 1:
+            return self.travelled
+        J = pose_by_error(self.camera)
+        step = relative_covariance(self.covariance.joint_poses(J, 2), self.before, self.pose)
+        D = np.linalg.solve(J.T, displacement(self.camera).T).T
+        return np.asarray(self.travelled + D @ step @ D.T)
+
+    def from_camera(self, rows: IndexArray) -> Array:
+        """Covariances (M, 3, 3) of landmarks' errors, in their coordinates, as seen from the camera."""
+        (own, cross, _), G = self.covariance.marginals(rows), self.landmarks.gauge[rows]
+        B, count = G @ displacement(self.camera), self.covariance.correlated
+        own += (B @ self.covariance.pose - 2 * cross) @ B.transpose(0, 2, 1)
+        left = (rows >= count) & ~self.landmarks.known[rows]
+        if left.any():
+            apart, G = self.covariance.apart.select(rows[left] - count), G[left]
+            own[left] = apart.seen + G @ (self.travelled_now() - apart.since) @ G.transpose(0, 2, 1)
+        return np.asarray(0.5 * (own + own.transpose(0, 2, 1)))
 
     def slid(self, slide: Slide, rows: IndexArray, r: Array) -> FilterState:
         """With landmarks of some rows (M,) of the state seen from r (3,), and their features slid there."""
         landmarks, walk = slide.walked(self.landmarks, rows, r)
         covariance = self.covariance.walked(rows, walk) if walk.any() else self.covariance
-        return replace(self, landmarks=landmarks, covariance=covariance)
+        return changed(self, landmarks=landmarks, covariance=covariance)
 
     # --- landmarks join and leave ---
 
@@ -69,43 +104,70 @@ class FilterState:
         if not len(ids):
             return self
         R, anchors = self.pose[:3, :3], np.repeat(self.pose[None, :3], len(h), axis=0)
-        new = FilterLandmarks.at(coordinates, ids, anchors, self.pose[:3, 3] + h @ R.T)
-        D = new.gauge[:, :, :3] @ R
-        noise = D @ covariances @ D.transpose(0, 2, 1)
-        by_rig = np.zeros((len(h), 3, self.covariance.by_rig.shape[1])) if by_rig is None else D @ by_rig
-        covariance = self.covariance.appended(new.gauge @ displacement(self.camera), noise, by_rig)
-        end = self.covariance.correlated
-        landmarks = self.landmarks.select(slice(end)).joined(new).joined(self.landmarks.select(slice(end, None)))
-        return replace(self, measured=True, landmarks=landmarks, covariance=covariance)
+        new = FilterLandmarks.at(coordinates, ids, anchors, self.pose[:3, 3] + h @ R.T, self.frame)
+        D, J = new.gauge[:, :, :3] @ R, new.gauge @ displacement(self.camera)
+        moved = J @ self.covariance.by_rig[:POSE] + (0.0 if by_rig is None else D @ by_rig)
+        noise = _block_diagonal(D @ covariances @ D.transpose(0, 2, 1))
+        return changed(self, measured=True)._with(new, self.covariance.appended(J, noise, moved))
 
     def inserted(self, new: FilterLandmarks, covariances: Array) -> FilterState:
         """With landmarks known from elsewhere, by covariances (M, 3, 3) of their coordinates."""
-        known = np.concatenate([self.covariance.known, covariances])
-        covariance = replace(self.covariance, known=known)
-        return replace(self, landmarks=self.landmarks.joined(new), covariance=covariance)
+        return self._with_apart(new, Apart.known(covariances, self.covariance.by_rig.shape[1]))
 
     def removed(self, ids: IdArray) -> FilterState:
         """Without some landmarks (M,)."""
-        gone = self.landmarks.rows_of(ids)
-        return self._rearranged(*(np.setdiff1d(part, gone) for part in self._parts())) if len(ids) else self
+        return self._without(self.landmarks.rows_of(ids)) if len(ids) else self
 
     def with_all_of(self, ids: IdArray) -> FilterState:
-        """With some landmarks (M,), which may be known from elsewhere, in the state."""
-        rows, (state, known) = self.landmarks.rows_of(ids), self._parts()
-        joining = np.sort(rows[rows >= len(state)])
-        if not len(joining):
+        """With some landmarks (M,), which may be apart, in the state.
+
+        Those that have left share the uncertainty of the camera's way since the later of two left. Those of a prior map
+        are independent of the pose in the world.
+        """
+        rows = self.landmarks.rows_of(ids)
+        rows = np.sort(rows[rows >= self.covariance.correlated])  # in the order in which they left
+        if not len(rows):
             return self
-        return self._rearranged(np.concatenate([state, joining]), np.setdiff1d(known, joining))
+        apart, new = self.covariance.apart.select(rows - self.covariance.correlated), self.landmarks.select(rows)
+        G = np.where(new.known[:, None, None], 0.0, new.gauge)
+        way = (G @ (self.travelled_now() - apart.since)).reshape(-1, POSE) @ G.reshape(-1, POSE).T
+        noise = _block_diagonal(apart.seen) + np.tril(way) + np.tril(way, -1).T
+        s = self._without(rows)
+        return s._with(new, s.covariance.appended(G @ displacement(self.camera), noise, apart.by_rig))
 
-    def _parts(self) -> tuple[IndexArray, IndexArray]:
-        """Rows of the landmarks that are in the state, and of those that are known from elsewhere."""
-        rows, count = np.arange(len(self.landmarks)), self.covariance.correlated
-        return rows[:count], rows[count:]
+    def with_most(self, most: int) -> FilterState:
+        """With so many landmarks in the state, at most, besides those of a prior map and those that are measured now.
 
-    def _rearranged(self, state: IndexArray, known: IndexArray) -> FilterState:
-        """With the landmarks of these rows of the table in each part."""
-        landmarks = self.landmarks.select(np.concatenate([state, known]))
-        return replace(self, landmarks=landmarks, covariance=self.covariance.rearranged(state, known))
+        Those that were measured longest ago leave it.
+        """
+        may = np.flatnonzero(~self.landmarks.known[: self.covariance.correlated])
+        if len(may) <= most:
+            return self
+        last = self.landmarks.last[may]
+        oldest = np.argsort(last, kind="stable")[: len(may) - most + most // _AT_ONCE]
+        rows = np.sort(may[oldest[last[oldest] < self.frame]])
+        if not len(rows):
+            return self
+        since, (own, _, by_rig) = np.tile(self.travelled_now(), (len(rows), 1, 1)), self.covariance.marginals(rows)
+        left = Apart(own, self.from_camera(rows), since, by_rig)
+        return self._without(rows)._with_apart(self.landmarks.select(rows), left)
+
+    def _without(self, gone: IndexArray) -> FilterState:
+        """Without the landmarks of some rows of the table."""
+        stays, count = np.delete(np.arange(len(self.landmarks)), gone), self.covariance.correlated
+        covariance = self.covariance.only(stays[stays < count], stays[stays >= count])
+        return changed(self, landmarks=self.landmarks.select(stays), covariance=covariance)
+
+    def _with(self, new: FilterLandmarks, covariance: Covariance) -> FilterState:
+        """With new landmarks, the last ones of the state."""
+        end, marks = self.covariance.correlated, self.landmarks
+        landmarks = marks.select(slice(end)).joined(new).joined(marks.select(slice(end, None)))
+        return changed(self, landmarks=landmarks, covariance=covariance)
+
+    def _with_apart(self, new: FilterLandmarks, what: Apart) -> FilterState:
+        """With new landmarks that are apart."""
+        covariance = changed(self.covariance, apart=self.covariance.apart.joined(what))
+        return changed(self, landmarks=self.landmarks.joined(new), covariance=covariance)
 
     # --- updates ---
 
@@ -120,14 +182,16 @@ class FilterState:
         and Bonnabel, 2015). Raises LinAlgError where the new state is not finite, or a variance is lost in rounding.
         """
         update, camera = found.at.update, found.camera
-        marks = self.landmarks.moved(update.coordinates, self._parts()[0], found.change[HEAD:].reshape(-1, 3))
+        change = found.change[HEAD:].reshape(-1, 3)
+        marks = self.landmarks.moved(update.coordinates, slice(len(change)), change)
+        marks.last[update.rows[found.used]] = self.frame
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise LinAlgError("the corrected state is not finite")
         J, shift = transport(update.camera, camera), self._shift(marks, camera)
         covariance = update.covariance.corrected(*found.gain(), J, shift)
         if not (covariance.P.diagonal()[HEAD:] > 0).all():
             raise LinAlgError("a landmark's variance would not stay positive")
-        return replace(self, camera=camera, landmarks=marks, covariance=covariance)
+        return changed(self, camera=camera, landmarks=marks, covariance=covariance)
 
     def displaced(self, coordinates: Coordinates, ids: IdArray, points: Array) -> FilterState:
         """With some landmarks at points (M, 3) [m]: their error stays, and the covariance is transported as above.
@@ -139,9 +203,16 @@ class FilterState:
         if not np.isfinite(marks.points).all():
             return self
         covariance = self.covariance.displaced(rows, (marks.c - before.c)[rows], self._shift(marks, self.camera))
-        return replace(self, landmarks=marks, covariance=covariance)
+        return changed(self, landmarks=marks, covariance=covariance)
 
     def _shift(self, marks: FilterLandmarks, camera: Camera) -> Array:
         """What is added to the errors (N, 3, 6) of landmarks that have moved, by the error of the pose."""
-        change = (marks.gauge - self.landmarks.gauge)[self._parts()[0]]
+        change = (marks.gauge - self.landmarks.gauge)[: self.covariance.correlated]
         return np.asarray(change @ displacement(camera) if camera.transports else np.zeros_like(change))
+
+
+def _block_diagonal(blocks: Array) -> Array:
+    """A matrix (3M, 3M) of the blocks (M, 3, 3) on its diagonal."""
+    each, out = np.arange(len(blocks)), np.zeros((len(blocks), 3, len(blocks), 3))
+    out[each, :, each] = blocks
+    return out.reshape(3 * len(blocks), -1)

@@ -84,15 +84,17 @@ class IekfConfig:
     Attributes:
         iterations: most linearisations in an update. More than one are made only where the first is not linear to
             within the noise.
+        kept: as that of `backends.ekf.backend.EkfConfig`.
 
     Raises:
         ConfigurationError: a value is out of its range.
     """
 
     iterations: int = 20
+    kept: int | None = 200
 
     def __post_init__(self) -> None:
-        require_not_negative(self, {"iterations": (1, 1000)}, "iekf")
+        require_not_negative(self, {"iterations": (1, 1000), "kept": (0, 10**6)}, "iekf")
 
 
 class IekfBackend(LandmarkFilter):
@@ -115,4 +117,4 @@ class IekfBackend(LandmarkFilter):
     def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
         self.config = from_options(IekfConfig, "iekf", options)
         first = InvariantCamera(models.initial_pose, np.zeros(3), np.zeros(3))
-        super().__init__(rig, models, first, InverseDepth(), self.config.iterations)
+        super().__init__(rig, models, first, InverseDepth(), self.config.iterations, self.config.kept)

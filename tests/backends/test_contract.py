@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import sys
 from dataclasses import replace
+from functools import partial
 from inspect import getattr_static
 from pathlib import Path
 
@@ -39,6 +40,11 @@ NAMES = [pytest.param(n, marks=pytest.mark.slow) if n == "batch" else n for n in
 @pytest.mark.parametrize("name", NAMES)
 def test_contract(name, check):
     check(registry.resolve("backends", name))
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=by_name)
+def test_a_filter_whose_landmarks_leave_its_state_passes_the_whole_contract(check):
+    check(partial(EkfBackend, kept=10))
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=by_name)
@@ -166,6 +172,11 @@ def test_the_suite_finds_what_is_broken_and_says_it_in_a_sentence(broken):
 @pytest.mark.parametrize("name", NAMES)
 def test_hostile_calls(name, seed):
     play(registry.resolve("backends", name), seed, calls=60 if seed < 100 else 80)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_hostile_calls_to_a_filter_whose_landmarks_leave_its_state(seed):
+    play(partial(EkfBackend, kept=3), seed, calls=60)
 
 
 def test_the_command_prints_how_far_a_back_end_comes(capsys, monkeypatch):
