@@ -98,9 +98,9 @@ class SmootherLandmarks(LandmarkRows):
         The pose is of an `age`, and those that measured the landmarks last are of ages `last` (S,), −1 for none.
 
         Where it measures more, none becomes one: many landmarks that come and go hold the path well enough, at half the
-        cost. A landmark becomes a variable when its smart factor is full: then it keeps what that says of it, as the
-        measurements go over. Variables that were not measured for longer than a factor spans make room, the oldest
-        first.
+        cost, and forget where features were that slide (`slam.models.SlideModel`). A landmark becomes a variable when
+        its smart factor is full: then it keeps what that says of it, as the measurements go over. Variables that were
+        not measured for longer than a factor spans make room, the oldest first.
 
         gtsam linearises a variable no more once a pose that measured it has left the lag. At an offset δ from there and
         a distance d a pixel is wrong by f (δ/d)²: less than its noise σ where d > δ `ratio`, with ``ratio² = f/σ``.

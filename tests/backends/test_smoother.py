@@ -390,6 +390,21 @@ def test_a_revision_that_changes_nothing_leaves_the_covariances():
     assert abs(np.median(sizes[1] / sizes[0]) - 1) < 0.01
 
 
+def test_a_revision_in_the_dark_keeps_how_far_the_camera_may_have_gone():
+    """Landmarks that come back were looked for within a tenth of the uncertainty of their pixels."""
+    data, backend, known = scene(path(60, DT, np.array([0.0, 0.0, 0.1]), np.zeros(3)), points=60), tracked([]), set()
+    for k, (stamp, _, seen) in enumerate(data):
+        if k < 40:
+            step(backend, stamp, seen, known)
+        else:
+            before = backend.predict(stamp)
+    backend.revise(lambda z: z)
+    after, at = backend.predict(60 * DT), {i: row for row, i in enumerate(before.ids.tolist())}
+    both = [(row, at[i]) for row, i in enumerate(after.ids.tolist()) if i in at]
+    ratio = [np.sqrt(np.trace(after.innovation[a]) / np.trace(before.innovation[b])) for a, b in both]
+    assert len(ratio) > 20 and 0.9 < np.median(ratio) < 1.3, "one more frame in the dark adds a little"
+
+
 def test_mended_measurements_do_not_part_the_path_from_poses_that_have_left():
     data = drive(60, points=400)
     backend = tracked(data, lag=6, past=0)
