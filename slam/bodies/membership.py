@@ -88,9 +88,9 @@ def remove_members(tracks: Tracks, rows: IndexArray, body: Body) -> None:
 def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> dict[int, tuple[Array, int]]:
     """Add the tracks that fit a measured body to its members, and remove those that do not, in place.
 
-    Inside a body that stereo resolves no proof of motion is needed. Returns by how much χ² each body explains its seen
-    members better than the still world (K,), and for how many others the still world is clearly better: inside it, and
-    behind one that is not proven, through which nothing should be seen.
+    Inside a body no proof of motion is needed. Returns by how much χ² each body explains its seen members better than
+    the still world (K,), and for how many others the still world is clearly better: inside it, and behind one that is
+    not proven, through which nothing should be seen.
     """
     said: dict[int, tuple[Array, int]] = {}
     bodies = {id: body for id, body in every.items() if body.measured}
@@ -102,7 +102,7 @@ def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> d
     best, whose = np.full(len(free), -np.inf), np.full(len(free), -1)
     for body in bodies.values():
         near = np.flatnonzero(_distances(body, tracks, free, MARGIN) < _NEAR)
-        gain, against = _gain_of_joining(body, frame.resolves(body.T[:3, 3]), tracks, free[near])
+        gain, against = _gain_of_joining(body, tracks, free[near])
         if not body.proven:
             behind = free[hidden([body], frame.eye, tracks.position[free])]
             against += int((membership_test(body, tracks, behind)[0] < -CLEAR).sum())
@@ -117,14 +117,14 @@ def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> d
     return said
 
 
-def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: IndexArray) -> tuple[Array, int]:
+def _gain_of_joining(body: Body, tracks: Tracks, rows: IndexArray) -> tuple[Array, int]:
     """By how much χ² a body explains tracks (N,) better than the still world; −∞ for those that may not join it.
 
     And how many of them stand still inside it.
     """
     away = _distances(body, tracks, rows, 0.0)
     inside = away < _NEAR
-    proof = tracks.expelled[rows] | (not resolved)
+    proof = tracks.expelled[rows]
     gain, fits, count = membership_test(body, tracks, rows)
     better = gain > np.where(inside & ~proof, -body.solid, CLEAR)
     joins = better & fits & (count >= np.where(proof, MIN_FRAMES, 2)) & ~tracks.still[rows]

@@ -23,9 +23,7 @@ WINDOW = 12
 SLOT = WINDOW - 1
 SIGMA = 0.002  # [m]
 RIG = StereoRig.rectified_pair(260.0, 160, 120, 0.12, 320, 240)
-FRAME: Any = SimpleNamespace(
-    setup=SimpleNamespace(config=ObjectsConfig()), slot=SLOT, eye=np.zeros(3), resolves=lambda _: True
-)
+FRAME: Any = SimpleNamespace(setup=SimpleNamespace(config=ObjectsConfig()), slot=SLOT, eye=np.zeros(3))
 TIMES = (np.arange(WINDOW) - SLOT) / 30.0
 
 
