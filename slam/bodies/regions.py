@@ -47,14 +47,13 @@ class Region:
         P[3:, 3:] += frame.setup.models.acceleration**2 * frame.dt * np.eye(3)
         return changed(self, state=F @ self.state, covariance=P, way=self.way + frame.dt * self.state[3:])
 
-    def has_moved(self, frame: Frame) -> bool:
+    def has_moved(self) -> bool:
         """Whether it has gone farther than it is wide, by its velocity: taking up other still tracks takes it, too."""
         ways = self.state[:3] - self.start, self.way
         return bool(
             len(self.rows) >= MINIMAL_POINTS
             and self.frames >= MIN_FRAMES
             and min(np.linalg.norm(way) for way in ways) > 2.0 * self.radius
-            and np.linalg.norm(self.state[3:]) > frame.setup.config.min_speed
         )
 
     def corrected(self, m: ConstantVelocity, spread: Array, rows: IndexArray) -> Region:
@@ -110,7 +109,7 @@ def follow_regions(regions: list[Region], frame: Frame, tracks: Tracks) -> tuple
         if r.unseen <= RUN:
             followed.append(r)
     followed += _new_regions(m, spread, radius, rows, np.flatnonzero(free))
-    moved = [r.has_moved(frame) for r in followed]
+    moved = [r.has_moved() for r in followed]
     return [r for r, far in zip(followed, moved) if not far], [r for r, far in zip(followed, moved) if far]
 
 
