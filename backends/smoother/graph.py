@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -115,7 +116,7 @@ class Graph:
             s = replace(s, landmarks=s.landmarks.without_variables(int(s.ages[-1])))
         return self.rebuilt(s), why
 
-    def rebuilt(self, s: SmootherState, steps: int = 1) -> Solved:
+    def rebuilt(self, s: SmootherState, steps: int = 0) -> Solved:
         """The solution with all anew, after so many `steps` more than usual; SolverError where gtsam fails."""
         self.restart()
         oldest, self._careful = s.oldest(self._lag, s.number), max(self._careful, s.number + 1)
@@ -143,11 +144,16 @@ class Graph:
             self._taken = len(s.sights[s.of(number)])
         kept = self._tracks.keep(problem, s)
         made = self._tracks.make_smart(problem, s.number < self._careful)
+        # Two steps of Gauss and Newton. What leaves the lag fixes where its neighbours stay linearised, and that is to
+        # be where they are once the newest pose is solved for. gtsam's clock is the latest time of a variable: in the
+        # first step all that is new has the time of the last update, so that nothing leaves.
+        now: dict[Any, Any] = dict.fromkeys(problem.values.keys(), float(s.ages[s.of(numbers.start)] - 1))
         with solving():
-            self._solver.update(problem.factors, problem.values, problem.ages, problem.removed)
+            self._solver.update(problem.factors, problem.values, now, problem.removed)
             slots = self._solver.getISAM2Result().getNewFactorsIndices()
             for _ in range(steps):
                 self._solver.update()
+            self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.ages)
             values = self._solver.calculateEstimate()
         for track, place in made:
             track.slot = slots[place]

@@ -13,7 +13,7 @@ from backends.smoother.steps import Steps, anchored
 from slam.geometry.se3 import Array, inverse, transform
 from slam.window.stereo import RectifiedStereo
 
-_AGAIN = 3  # numerics: steps of Gauss and Newton after the first
+_AGAIN = 2  # numerics: steps of Gauss and Newton after the first
 
 
 def corrected(s: SmootherState, correct: Callable[[Array], Array]) -> SmootherState:
