@@ -53,6 +53,7 @@ def test_a_world_and_a_format_of_one_s_own_are_opened_by_module_and_name(tmp_pat
         for name, image in (("a", frame.left), ("b", frame.right)):
             cv2.imwrite(str(tmp_path / name / f"{frame.stamp + 1:.3f}.png"), image)
     assert "worlds.scenes" not in (DOCS / "examples/hall.py").read_text()  # so that scenes.py can name its scene
+    assert "from slam.sequences import" not in (DOCS / "examples/pairs_format.py").read_text()  # as a module of it
     read = slam.open_sequence(tmp_path, "pairs_format:open_folder")
     assert read.rig.baseline == world.rig.baseline and read.stamps == pytest.approx(world.stamps + 1, abs=1e-3)
     for one, other in zip(world, read, strict=True):

@@ -5,7 +5,7 @@ FOLDER holds ``a/1.50.png``, ``b/1.50.png`` … (left, right, named by their tim
 
 import numpy as np
 
-from slam.sequences import RecordedSequence
+from slam.sequences.base import RecordedSequence
 from slam.sequences.pairs import Listing, open_images
 from slam.sequences.rigs import calibration_files, read_rig
 
@@ -14,7 +14,7 @@ def open_folder(folder, options, faults):
     """A sequence of a folder; ``options`` are those behind its ``?``, and ``faults.report(kind, line)`` warns."""
     sides = []
     for name in ("a", "b"):
-        files = sorted((folder / name).glob("*.png"), key=lambda file: float(file.stem))
+        files = sorted((folder / name).glob("*.png"), key=lambda file: float(file.stem))  # stamps must increase
         stamps = np.array([round(1e9 * float(file.stem)) for file in files])  # [ns]
         sides.append(Listing(folder / name, stamps, [file.name for file in files], stamped=True))
     pairs, decode, size = open_images(sides, options, faults)  # pairs them by stamp, and reads one pair

@@ -35,8 +35,8 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     """Run the demo; returns the runs' summaries, which are also in ``summary.json`` of each run's folder.
 
     Leaves a folder per back end with the files of a run, and the pictures ``summary.png`` and ``frame.png`` (the last
-    frame in which the box was measured). Raises SlamError where a file cannot be written, or is
-    there already and may not be replaced.
+    frame in which the box was measured, else the last). Raises SlamError where a file cannot be written, or is there
+    already and may not be replaced.
     """
     require_no_recording(out)
     own = Output(out, "--out", [PICTURE, _FRAME])
@@ -48,7 +48,7 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     if not quiet:
         seconds = _SECONDS * len(ONLINE) * frames
         print(f"{len(ONLINE)} runs of {frames} frames: {seconds:.0f} s on two idle cores, 40 s more the first time")
-        print("tracked 73/175: the camera is tracked by 73 of the 175 landmarks in the map")
+        print("tracked N/M: the camera is tracked by N of the M landmarks in the map")
     for backend in ONLINE:
         config = SystemConfig.for_kind(sequence.kind)
         record = RunRecord()  # its time of compiling begins here
@@ -68,5 +68,6 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     if not quiet:
         print_summary(summaries, [out])
         print(_WHY)
-        print(f"Open first: {out / PICTURE}; then {out / _FRAME}, the box in the image")
+        box = "the box in the image" if True in shown else "without the box: to find it takes more --frames"
+        print(f"Open first: {out / PICTURE}; then {out / _FRAME}, {box}")
     return summaries

@@ -243,5 +243,4 @@ def caution(plan: Plan, trials: int) -> str:
         return "One trial cannot tell a difference from chance; a recorded sequence has no more, worlds have --trials."
     if (least := reach(trials, tests)) > _HARDLY:
         return f"{trials} trials can hardly show any difference; take --trials {_FEW} or more."
-    scatter = f"{least:.2g} times its scatter from trial to trial"
-    return f"With {trials} trials only a difference of {scatter} can be told from chance."
+    return f"With {trials} trials differences below {least:.2g} times their scatter from trial to trial may be chance."

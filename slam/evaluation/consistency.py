@@ -32,10 +32,10 @@ from slam.geometry.trajectory import Trajectory, TruthNoise
 #: Lengths of the stretches over which relative poses are compared [m].
 STRETCHES = (1.0, 10.0, 100.0)
 
-#: Beside the figures: the cameras are those of the calibration, while the covariances count errors of one.
+#: Beside the figures: the cameras are those of the calibration, while the covariances may count errors of one.
 EXACT = "exact calibration"
 
-#: The same, where the back end's covariances count no errors of the calibration, as others' do.
+#: Beside the figures: the back end's covariances count no errors of the calibration, as others' do.
 PIXELS_ALONE = "pixel noise alone"
 
 #: Beside the figures, where there are any: how many poses come before the first one that has truth.

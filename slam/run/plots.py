@@ -305,7 +305,8 @@ def _draw_map(axis: Axes, run: RunData, colour: str) -> Array:
 def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
     """Errors of position and rotation, and the σ that is claimed; that alone where no true path is known.
 
-    Where the true path has errors of its own, the σ of both together is shown, too.
+    Where the true path has errors of its own, the σ of both together is shown, too. Where the first true poses are
+    missing or doubtful, the title says since when errors count: σ counts from the start, see `pose_errors`.
     """
     from matplotlib.lines import Line2D
     from matplotlib.ticker import LogLocator
@@ -343,12 +344,16 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
         axis.set_xlim(-0.01 * end, 1.01 * end or 1.0)
     axes[0].tick_params(labelbottom=False)
     measured = [run for run in runs if run.truth is not None and not run.truth_is_exact]
+    late = dict.fromkeys(number(time[0]) for run, (time, *_) in zip(runs, series) if run.truth is not None and time[0])
     title = "Online error since the start (solid), claimed σ (dashed)"
+    if late:
+        title = f"Online error since {' or '.join(late)} s (solid), claimed σ since 0 s (dashed):"
+        title += "\ncompare them only where σ is far above its first value"
     if measured:
         exact = all(run.truth_noise == TruthNoise() for run in measured)
         title += "\nthe truth counts as exact" if exact else "\nσ with that of the truth (dotted)"
     if known and any(len(time) < len(run.online) for run, (time, *_) in zip(runs, series)):
-        title += "; grey: the truth is doubtful"
+        title += "; grey: no sure truth"
     if any(run.summary.get("truth_doubt") for run in runs):
         title += "\nthe true path and the estimated one do not fit"
     axes[0].set_title(title if known else "Claimed σ of the online pose; no true path is known")

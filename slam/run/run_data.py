@@ -166,6 +166,9 @@ def pose_errors(run: RunData) -> tuple[Array, Array, Array, Array]:
     Of these (N, 2) the columns are the distance from the true position [m], see `place_of_truth`, and the angle of the
     rotation's error [deg]. Without a truth the errors are zero. A σ is that of all axes together; the expected one has
     that of the truth, too, as the NEES from the start has it.
+
+    Errors count from the first pose whose truth was measured, and a claimed σ from the path's first pose. Where these
+    differ, the σ since the former, which a run does not write, is the claimed one give or take that pose's own at most.
     """
     if run.truth is None:
         stamps = run.online.stamps

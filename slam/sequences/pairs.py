@@ -29,7 +29,7 @@ _TOLERANCE = 5_000_000  # [ns] between the stamps of a pair: hardware-triggered 
 
 @dataclass(frozen=True, eq=False)
 class Listing:
-    """The images of one camera, in order of time."""
+    """The images of one camera, in order of their keys: sort the rows first, `open_images` refuses others."""
 
     folder: Path
     keys: IntArray  # what pairs them with the other camera's (N,), increasing: stamps [ns] or frame numbers
@@ -55,7 +55,10 @@ class Pairs(NamedTuple):
 def open_images(
     sides: list[Listing], options: Options, faults: FaultLog, times: Times | None = None, by_number: bool = False
 ) -> tuple[Pairs, Decoder, Size]:
-    """Pair image files, see `pair_up`: which make a frame, what decodes them, and the size of a camera's images."""
+    """Pair image files, see `pair_up`: which make a frame, what decodes them, and the size of a camera's images.
+
+    SequenceError, too, where no pair can be read.
+    """
     pairs = pair_up(sides, options, faults, times, by_number)
     frames = [
         [None if row < 0 else side.folder / side.names[row] for side, row in zip(sides, rows)]
@@ -162,8 +165,16 @@ def pair_up(
 
     Time is by the file of `times`, else by ``fps``, else by stamps, else by numbers at `RATE`. Rows of the file belong
     to the left images that they name, else to those in order; with `by_number`, or where there are more rows than
-    images, a row's number is a frame's. SequenceError where nothing pairs, or hardly a frame has a time.
+    images, a row's number is a frame's. SequenceError where a listing has no rows or its keys do not increase, nothing
+    pairs, or hardly a frame has a time.
     """
+    for side in sides:
+        if not len(side):
+            raise SequenceError(f"{side.folder}: no images")
+        if len(back := np.flatnonzero(np.diff(side.keys) <= 0)):
+            one, other = side.names[back[0]], side.names[back[0] + 1]
+            what = "stamps" if side.stamped else "numbers"
+            raise SequenceError(f"{side.folder}: the images are not in order of their {what}: {other} follows {one}")
     left, rows = sides[0], np.arange(len(sides[0]))[:, None]
     if len(sides) == 2:
         rows = _partners(left, sides[1], options, times is not None or "fps" in options, faults)

@@ -17,7 +17,7 @@ from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.object_data import MovingObject, ObjectEstimate
 from slam.run.drawing import FramePictures, draw_objects
 from slam.run.options import RunOptions
-from slam.run.plots import draw_paths
+from slam.run.plots import draw_errors, draw_paths
 from slam.run.run_data import RunData, pose_errors
 from slam.run.runner import run
 
@@ -102,3 +102,17 @@ def test_where_the_truth_s_sensor_is_and_its_clock_are_part_of_the_expected_erro
     rates = np.diff(finished.truth.positions, axis=0) / np.diff(finished.truth.stamps)[:, None]
     expected = 0.1 * np.linalg.norm(rates[-1] - rates[0])
     assert np.sqrt(late[-1, 0] ** 2 - exact[-1, 0] ** 2) == pytest.approx(expected, rel=0.05)
+
+
+def test_the_title_says_since_when_errors_count_where_the_first_true_poses_are_not_known(finished):
+    """Errors began anew where the truth did, beside a σ since the start: they looked far smaller than claimed."""
+    begun = replace(finished, truth=finished.truth.select(np.arange(3, len(finished.truth))))
+    time, error, sigma, _ = pose_errors(begun)
+    assert time[0] == pytest.approx(0.1) and error[0, 0] < 1e-9 and sigma[0, 0] > 1e-3
+    for runs, since in (([finished], "the start"), ([begun], "0.1 s"), ([finished, begun], "0.1 s")):
+        axes = Figure().subplots(2)
+        draw_errors(axes, runs)
+        title = axes[0].get_title()
+        assert f"Online error since {since} (solid)" in title
+        for words in ("only where σ is far above its first value", "grey: no sure truth"):
+            assert (words in title) == (begun in runs)

@@ -47,6 +47,10 @@ def test_covariances_that_are_too_large_on_an_exact_world_say_why(tmp_path):
         assert said.endswith("this world's cameras have none") == exact == ("are on the safe side" in said)
         (group,) = groups(plan, [Run(trial, "completed", figures(tree), {}, tmp_path)])
         assert honesty(group) == [f"ekf: {said}."]
+    tree["consistency"] |= {"exact calibration": True, "pixel noise alone": True}  # these are not on the safe side
+    said = verdict_of_run(tree)
+    assert said.startswith("covariances are too large") and said.count("they count") == 1
+    assert said.endswith("; they count pixel noise alone, and no errors of the calibration")
 
 
 def test_a_truth_less_exact_than_what_is_claimed_is_said_with_all_its_errors():

@@ -11,6 +11,9 @@ import pytest
 
 from slam.errors import CalibrationError, SequenceError
 from slam.sequences import open_sequence
+from slam.sequences.base import FaultLog
+from slam.sequences.options import RECORDED, Options
+from slam.sequences.pairs import Listing, Pairs, pair_up
 from tests import recordings
 
 RIGHT = {"euroc": "mav0/cam1", "kitti": "image_1", "raw": "image_01", "two_folders": "right"}
@@ -116,3 +119,22 @@ def test_ground_truth_that_cannot_be_true_is_left_out(kitti, R, t, words):
     path.write_text("1 0 0 0 0 1 0 0 0 0 1 1\n" * 4)
     sequence = open_sequence(kitti)
     assert len(sequence.ground_truth) == 4 and "4 poses, 2 frames are beyond them" in sequence.warnings[0]
+
+
+def test_a_listing_without_rows_or_out_of_order_is_an_error(tmp_path: Path) -> None:
+    """None at all was an error of an array's size; rows out of order cost frames, as if they had no partner."""
+    names = [f"{stamp}.png" for stamp in (1, 2, 3)]
+
+    def paired(*stamps: int) -> Pairs:
+        right = Listing(tmp_path / "b", np.array(stamps, np.int64), names[: len(stamps)], True)
+        sides = [Listing(tmp_path / "a", np.arange(3), names, True), right]
+        return pair_up(sides, Options("", "pairs", RECORDED), FaultLog([]))
+
+    assert len(paired(0, 1, 2).stamps) == 3
+    for stamps, said in (
+        ((), "b: no images"),
+        ((0, 2, 1), r"b: the images are not in order of their stamps: 3\.png follows 2\.png"),
+        ((0, 1, 1), r"stamps: 3\.png follows 2\.png"),
+    ):
+        with pytest.raises(SequenceError, match=said):
+            paired(*stamps)
