@@ -30,9 +30,9 @@ class EkfConfig:
             updates where the first is not linear to within the noise.
         landmarks: coordinates of a landmark in the state: ``"inverse_depth"`` by the camera that saw it first, or
             ``"euclidean"`` in the world, as the papers do. See `backends.ekf.landmarks`.
-        kept: most landmarks that keep their covariance with the camera and each other, besides those of a prior map; of
-            others, those that were measured longest ago leave the state. Null (in Python None) keeps all, as the papers
-            do. See `backends.ekf.state.FilterState`.
+        kept: most landmarks that keep their covariance with the camera and each other, besides those of a prior map and
+            those that the last frame measured; of others, those that were measured longest ago leave the state. Null
+            (in Python None) keeps all, as the papers do. See `backends.ekf.state.FilterState`.
         consistent: keep the unobservable pose of the whole map (where the world's origin is and which way it faces)
             from seeming to be measured: the covariance is transported to the corrected state after each update.
 

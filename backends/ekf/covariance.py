@@ -146,8 +146,10 @@ class Covariance:
 
     def only(self, rows: IndexArray, apart: IndexArray) -> Covariance:
         """With these landmarks alone, in each of its two parts; by their rows of the table of landmarks."""
-        numbers = np.append(np.arange(HEAD), self.numbers(rows))
         kept = self.apart.select(apart - self.correlated)
+        if len(rows) == self.correlated:
+            return changed(self, apart=kept)
+        numbers = np.append(np.arange(HEAD), self.numbers(rows))
         return Covariance(reordered(self.P, numbers), self.by_rig[numbers], kept)
 
     # --- an update ---

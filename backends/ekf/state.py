@@ -24,10 +24,11 @@ class FilterState:
     """A camera and three coordinates per landmark, with the joint covariance of their errors.
 
     Landmarks that were measured long ago leave the matrix. They stay in the map, where they were, with their covariance
-    in the world. As seen from the camera, they are as uncertain as when they left, and by its way since: what it has
-    travelled is the sum over its steps of their covariances, as if they were independent, each as a displacement of the
-    world. So are they predicted, and so do those that are measured again join, as new ones would: independent of the
-    pose as seen from the camera. They tell it nothing of the past, and nothing is counted twice.
+    in the world. As seen from the camera, they are as uncertain as when they left, plus what its way since adds: the
+    sum over its steps of their covariances, as if they were independent, each as a displacement of the world. That is
+    too much where it stays among its landmarks, or has found them again after the dark. So are they predicted, and so
+    do those that are measured again join, as new ones would: independent of the pose as seen from the camera. They tell
+    it nothing of the past, and nothing is counted twice.
     """
 
     stamp: float  # time [s]; NaN before the first prediction
@@ -66,13 +67,18 @@ class FilterState:
         return FilterState(stamp, self.frame + 1, False, camera, self.landmarks, covariance, self.pose, travelled)
 
     def travelled_now(self) -> Array:
-        """What the camera has travelled by now (6, 6)."""
+        """What the camera has travelled by now (6, 6).
+
+        Steps in a row that no landmark measures err alike, as their velocity does: their deviations add up, those
+        before being at most as large as the last.
+        """
         if self.frame < 1:
             return self.travelled
+        unmeasured = max(self.frame - int(self.landmarks.last.max(initial=-1)), 1)
         J = pose_by_error(self.camera)
         step = relative_covariance(self.covariance.joint_poses(J, 2), self.before, self.pose)
         D = np.linalg.solve(J.T, displacement(self.camera).T).T
-        return np.asarray(self.travelled + D @ step @ D.T)
+        return np.asarray(self.travelled + (2 * unmeasured - 1) * (D @ step @ D.T))
 
     def from_camera(self, rows: IndexArray) -> Array:
         """Covariances (M, 3, 3) of landmarks' errors, in their coordinates, as seen from the camera."""

@@ -97,6 +97,21 @@ def test_one_that_is_measured_again_is_new_to_the_camera(name):
 
 
 @BOTH
+@pytest.mark.parametrize("dark", [3, 10, 30])
+def test_in_the_dark_one_that_has_left_is_no_better_known_than_one_that_stayed(name, dark):
+    found = []
+    for leave in (True, False):
+        backend, *_ = swayed(name, 40, kept=None)
+        ids = left(backend.state.with_most(KEPT))
+        backend.state = backend.state.with_most(KEPT) if leave else backend.state
+        for k in range(dark):
+            backend.predict(DT * (40 + k))
+        found.append(backend.state.from_camera(backend.state.landmarks.rows_of(ids)))
+    ratio = np.trace(found[0], axis1=1, axis2=2) / np.trace(found[1], axis1=1, axis2=2)
+    assert len(ratio) > 50 and ratio.min() > 1.0 and ratio.max() < 2.0**2
+
+
+@BOTH
 def test_a_camera_that_turns_away_and_back_knows_how_far_it_is_off(name):
     """In the world, and over its last steps, where those that have left come back; nothing is counted twice."""
     nees, steps, again = [], [], 0
