@@ -70,11 +70,13 @@ def test_one_system_used_from_two_threads_says_so_and_goes_on(backend, monkeypat
         lambda: system.process_features(SEQUENCE.observations(FIRST + 2)), system.estimate, system.snapshot,
         system.trajectory, lambda: pickle.dumps(system),
     ]  # fmt: skip
-    for call in calls:
-        with pytest.raises(SlamError, match=r"^this system is in use by another thread"):
-            call()
-    go.set()
-    thread.join()
+    try:
+        for call in calls:
+            with pytest.raises(SlamError, match=r"^this system is in use by another thread"):
+                call()
+    finally:
+        go.set()
+        thread.join()
     monkeypatch.undo()
     for k in range(2, FRAMES):
         system.process_features(SEQUENCE.observations(FIRST + k))
