@@ -1,8 +1,8 @@
 """The filter's covariance: of the camera, its last poses and the landmarks, one dense matrix.
 
-The last poses are corrected no more: they stay as they were believed in their time (stochastic clones). Their errors'
+The past poses are corrected no more: they stay as they were believed in their time (stochastic clones). Their errors'
 covariance with the others goes on, as in the filter of Schmidt, which is exact for what it does: with a gain of zero
-``P_ab ← (1 − K H) P_ab`` and ``P_bb`` stays.
+``P_ab ← (1 − K H) P_ab`` and ``P_bb`` stays. They are the last poses, and the one from which landmarks left last.
 Landmarks that are independent of all else until they are measured are apart from the matrix: those that are known from
 elsewhere, and those that were measured so long ago that they have left it.
 
@@ -26,7 +26,7 @@ from slam.runtime.compilation import kernel
 CAMERA = 12  #: fixed: size of the camera's state [r, φ, v, ω]
 POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 RECENT = 4  #: cost: poses before the present one that are kept
-HEAD = CAMERA + POSE * RECENT  #: fixed: size of camera and last poses, behind which the landmarks stand
+HEAD = CAMERA + POSE * (RECENT + 1)  #: fixed: size of camera and past poses, behind which the landmarks stand
 _BLOCK = 32  # cost: rows and columns that are mirrored at once
 
 
@@ -36,7 +36,7 @@ class Apart(Table):
 
     own: Array  # covariances (C, 3, 3)
     seen: Array  # of those that have left, covariances (C, 3, 3) of the error as seen from the camera of that time
-    since: Array  # and what that had travelled (C, 6, 6); see `backends.ekf.state.FilterState`
+    way: Array  # and of the camera's way from then to the last leaving (C, 6, 6); see `backends.ekf.state.FilterState`
     by_rig: Array  # derivatives (C, 3, m) by errors of the rig
 
     @classmethod
@@ -47,10 +47,11 @@ class Apart(Table):
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Of ``[camera (12), last poses (24), N landmarks (3N)]``, n numbers.
+    """Of ``[camera (12), last poses (24), pose of the last leaving (6), N landmarks (3N)]``, n numbers.
 
-    The poses are perturbed on the right, the newest first; zero before there are so many. Rows of the table of
-    landmarks are in this order; behind them are those that are apart.
+    The last poses are perturbed on the right, the newest first; zero before there are so many. The error of the pose of
+    the last leaving is the displacement of the world that it is. Rows of the table of landmarks are in this order;
+    behind them are those that are apart.
     """
 
     P: Array  # (n, n)
@@ -107,15 +108,34 @@ class Covariance:
 
     # --- the camera moves ---
 
-    def camera_moved(self, J: Array, noise: Array, by_error: Array | None = None) -> Covariance:
-        """The camera's error (12,) becomes J times what it was, plus noise (12, 12).
-
-        With `by_error`, the pose before, that (6, 6) times [r, φ], is now the first of the last ones; the last goes.
-        """
-        F = np.eye(HEAD) if by_error is None else np.eye(HEAD, k=-POSE)
+    def camera_moved(self, J: Array, noise: Array) -> Covariance:
+        """The camera's error (12,) becomes J times what it was, plus noise (12, 12)."""
+        F = np.eye(HEAD)
         F[:CAMERA, :CAMERA] = J
-        if by_error is not None:
-            F[CAMERA : CAMERA + POSE, :POSE], F[CAMERA : CAMERA + POSE, POSE:CAMERA] = by_error, 0.0
+        return self._moved(F, noise)
+
+    def advanced(self, J: Array, noise: Array, by_error: Array) -> Covariance:
+        """The same; the pose before, `by_error` (6, 6) times [r, φ], is now the first of the last ones; the last goes."""
+        F = np.eye(HEAD, k=-POSE)
+        F[:CAMERA, :CAMERA], F[-POSE:], F[-POSE:, -POSE:] = J, 0.0, np.eye(POSE)
+        F[CAMERA : CAMERA + POSE, :CAMERA] = np.eye(POSE, CAMERA)
+        F[CAMERA : CAMERA + POSE, :POSE] = by_error
+        return self._moved(F, noise)
+
+    def leaving_here(self, W: Array) -> Covariance:
+        """The pose is that of the last leaving; its error W (6, 6) times [r, φ] displaces the world."""
+        F = np.eye(HEAD)
+        F[-POSE:, -POSE:], F[-POSE:, :POSE] = 0.0, W
+        return self._moved(F, 0.0)
+
+    def way(self, W: Array) -> Array:
+        """Of the error (6,) of the displacement of the world from the last leaving until now, W (6, 6) times [r, φ]."""
+        now, then, P = slice(POSE), slice(HEAD - POSE, HEAD), self.P
+        D = W @ P[now, then]
+        D = W @ P[now, now] @ W.T - D - D.T + P[then, then]
+        return np.asarray(0.5 * (D + D.T))
+
+    def _moved(self, F: Array, noise: Array | float) -> Covariance:
         P, by_rig = self.P.copy(), self.by_rig.copy()
         P[:HEAD], by_rig[:HEAD] = F @ P[:HEAD], F @ by_rig[:HEAD]
         own = P[:HEAD, :HEAD] @ F.T
@@ -157,7 +177,7 @@ class Covariance:
     def corrected(self, V: Array, by_rig: Array, J: Array, shift: Array) -> Covariance:
         """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ`` (paper A, Eq. 11).
 
-        The last poses keep the covariance that they have among themselves.
+        The past poses keep the covariance that they have among themselves.
 
         Args:
             V: ``K S Kᵀ = V Vᵀ`` (n, ·).

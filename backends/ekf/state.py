@@ -14,7 +14,6 @@ from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
 from slam.data import IdArray, IndexArray
 from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array
-from slam.window.stereo import relative_covariance
 
 _AT_ONCE = 8  # cost: one of so many landmarks leaves at once, so that the matrix is not copied in every frame
 
@@ -24,11 +23,11 @@ class FilterState:
     """A camera and three coordinates per landmark, with the joint covariance of their errors.
 
     Landmarks that were measured long ago leave the matrix. They stay in the map, where they were, with their covariance
-    in the world. As seen from the camera, they are as uncertain as when they left, plus what its way since adds: the
-    sum over its steps of their covariances, as if they were independent, each as a displacement of the world. That is
-    too much where it stays among its landmarks, or has found them again after the dark. So are they predicted, and so
-    do those that are measured again join, as new ones would: independent of the pose as seen from the camera. They tell
-    it nothing of the past, and nothing is counted twice.
+    in the world. As seen from the camera, they are as uncertain as when they left, plus what its way since adds, as a
+    displacement of the world. The pose of the last leaving is in the state, so its covariance is known from there on;
+    those from one leaving to the next are added as if they were independent. So are they predicted, and so do those
+    that are measured again join, as new ones would: independent of the pose as seen from the camera. They tell it
+    nothing of the past, and nothing is counted twice.
     """
 
     stamp: float  # time [s]; NaN before the first prediction
@@ -37,14 +36,11 @@ class FilterState:
     camera: Camera
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of everything
-    before: Array  # the pose (4, 4) of the prediction before
-    travelled: Array  # what the camera had travelled then (6, 6)
 
     @classmethod
     def first(cls, camera: Camera, P: Array) -> FilterState:
         """Before the first prediction, with the covariance (12, 12) of the camera's error."""
-        covariance, still = Covariance.of_camera(P), np.zeros((POSE, POSE))
-        return cls(float("nan"), -1, True, camera, FilterLandmarks.none(), covariance, camera.pose, still)
+        return cls(float("nan"), -1, True, camera, FilterLandmarks.none(), Covariance.of_camera(P))
 
     # --- the camera ---
 
@@ -62,23 +58,8 @@ class FilterState:
     def advanced(self, stamp: float, motion: Motion) -> FilterState:
         """At a later time, after a motion of the camera."""
         camera, J, noise = motion
-        covariance = self.covariance.camera_moved(J, noise, pose_by_error(self.camera))
-        travelled = self.travelled_now() if len(covariance.apart) else self.travelled  # it is counted once one has left
-        return FilterState(stamp, self.frame + 1, False, camera, self.landmarks, covariance, self.pose, travelled)
-
-    def travelled_now(self) -> Array:
-        """What the camera has travelled by now (6, 6).
-
-        Steps in a row that no landmark measures err alike, as their velocity does: their deviations add up, those
-        before being at most as large as the last.
-        """
-        if self.frame < 1:
-            return self.travelled
-        unmeasured = max(self.frame - int(self.landmarks.last.max(initial=-1)), 1)
-        J = pose_by_error(self.camera)
-        step = relative_covariance(self.covariance.joint_poses(J, 2), self.before, self.pose)
-        D = np.linalg.solve(J.T, displacement(self.camera).T).T
-        return np.asarray(self.travelled + (2 * unmeasured - 1) * (D @ step @ D.T))
+        covariance = self.covariance.advanced(J, noise, pose_by_error(self.camera))
+        return FilterState(stamp, self.frame + 1, False, camera, self.landmarks, covariance)
 
     def from_camera(self, rows: IndexArray) -> Array:
         """Covariances (M, 3, 3) of landmarks' errors, in their coordinates, as seen from the camera."""
@@ -88,7 +69,7 @@ class FilterState:
         left = (rows >= count) & ~self.landmarks.known[rows]
         if left.any():
             apart, G = self.covariance.apart.select(rows[left] - count), G[left]
-            own[left] = apart.seen + G @ (self.travelled_now() - apart.since) @ G.transpose(0, 2, 1)
+            own[left] = apart.seen + G @ (apart.way + self._way()) @ G.transpose(0, 2, 1)
         return np.asarray(0.5 * (own + own.transpose(0, 2, 1)))
 
     def slid(self, slide: Slide, rows: IndexArray, r: Array) -> FilterState:
@@ -136,7 +117,7 @@ class FilterState:
             return self
         apart, new = self.covariance.apart.select(rows - self.covariance.correlated), self.landmarks.select(rows)
         G = np.where(new.known[:, None, None], 0.0, new.gauge)
-        way = (G @ (self.travelled_now() - apart.since)).reshape(-1, POSE) @ G.reshape(-1, POSE).T
+        way = (G @ (apart.way + self._way())).reshape(-1, POSE) @ G.reshape(-1, POSE).T
         noise = _block_diagonal(apart.seen) + np.tril(way) + np.tril(way, -1).T
         s = self._without(rows)
         return s._with(new, s.covariance.appended(G @ displacement(self.camera), noise, apart.by_rig))
@@ -154,9 +135,15 @@ class FilterState:
         rows = np.sort(may[oldest[last[oldest] < self.frame]])
         if not len(rows):
             return self
-        since, (own, _, by_rig) = np.tile(self.travelled_now(), (len(rows), 1, 1)), self.covariance.marginals(rows)
-        left = Apart(own, self.from_camera(rows), since, by_rig)
-        return self._without(rows)._with_apart(self.landmarks.select(rows), left)
+        (own, _, by_rig), seen = self.covariance.marginals(rows), self.from_camera(rows)
+        s, left = self._without(rows), Apart(own, seen, np.zeros((len(rows), POSE, POSE)), by_rig)
+        apart = changed(s.covariance.apart, way=s.covariance.apart.way + self._way())
+        covariance = changed(s.covariance.leaving_here(displacement(self.camera)), apart=apart)
+        return changed(s, covariance=covariance)._with_apart(self.landmarks.select(rows), left)
+
+    def _way(self) -> Array:
+        """Covariance (6, 6) of the camera's way since the last leaving."""
+        return self.covariance.way(displacement(self.camera))
 
     def _without(self, gone: IndexArray) -> FilterState:
         """Without the landmarks of some rows of the table."""
