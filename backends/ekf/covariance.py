@@ -2,7 +2,7 @@
 
 The past poses are corrected no more: they stay as they were believed in their time (stochastic clones). Their errors'
 covariance with the others goes on, as in the filter of Schmidt, which is exact for what it does: with a gain of zero
-``P_ab ← (1 − K H) P_ab`` and ``P_bb`` stays. They are the last poses, and the one from which landmarks left last.
+``P_ab ← (1 − K H) P_ab`` and ``P_bb`` stays. They are the last poses, and the one that landmarks left.
 Landmarks that are independent of all else until they are measured are apart from the matrix: those that are known from
 elsewhere, and those that were measured so long ago that they have left it.
 
@@ -27,6 +27,7 @@ CAMERA = 12  #: fixed: size of the camera's state [r, φ, v, ω]
 POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 RECENT = 4  #: cost: poses before the present one that are kept
 HEAD = CAMERA + POSE * (RECENT + 1)  #: fixed: size of camera and past poses, behind which the landmarks stand
+LEAVING = slice(HEAD - POSE, HEAD)  #: fixed: where the last of these stands, the pose that landmarks left
 _BLOCK = 32  # cost: rows and columns that are mirrored at once
 
 
@@ -35,8 +36,8 @@ class Apart(Table):
     """What is known of the coordinates of landmarks (C,) that are independent of all else."""
 
     own: Array  # covariances (C, 3, 3)
-    seen: Array  # of those that have left, covariances (C, 3, 3) of the error as seen from the camera of that time
-    way: Array  # and of the camera's way from then to the last leaving (C, 6, 6); see `backends.ekf.state.FilterState`
+    seen: Array  # of those that have left, covariances (C, 3, 3) of the error as seen from a pose that they left
+    way: Array  # and of the way from that to the last such pose (C, 6, 6); see `backends.ekf.state.FilterState`
     by_rig: Array  # derivatives (C, 3, m) by errors of the rig
 
     @classmethod
@@ -47,11 +48,11 @@ class Apart(Table):
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Of ``[camera (12), last poses (24), pose of the last leaving (6), N landmarks (3N)]``, n numbers.
+    """Of ``[camera (12), last poses (24), the pose that landmarks left (6), N landmarks (3N)]``, n numbers.
 
-    The last poses are perturbed on the right, the newest first; zero before there are so many. The error of the pose of
-    the last leaving is the displacement of the world that it is. Rows of the table of landmarks are in this order;
-    behind them are those that are apart.
+    The last poses are perturbed on the right, the newest first; zero before there are so many. The error of the pose
+    that landmarks left is a displacement of the world; see `backends.ekf.state.FilterState`. Rows of the table of
+    landmarks are in this order; behind them are those that are apart.
     """
 
     P: Array  # (n, n)
@@ -115,27 +116,25 @@ class Covariance:
         return self._moved(F, noise)
 
     def advanced(self, J: Array, noise: Array, by_error: Array) -> Covariance:
-        """The same; the pose before, `by_error` (6, 6) times [r, φ], is now the first of the last ones; the last goes."""
+        """The same; `by_error` (6, 6) times [r, φ], the pose before, is the first of the last ones; the oldest goes."""
         F = np.eye(HEAD, k=-POSE)
-        F[:CAMERA, :CAMERA], F[-POSE:], F[-POSE:, -POSE:] = J, 0.0, np.eye(POSE)
-        F[CAMERA : CAMERA + POSE, :CAMERA] = np.eye(POSE, CAMERA)
-        F[CAMERA : CAMERA + POSE, :POSE] = by_error
+        F[:CAMERA, :CAMERA], F[LEAVING], F[LEAVING, LEAVING] = J, 0.0, np.eye(POSE)
+        F[CAMERA : CAMERA + POSE, :CAMERA] = np.pad(by_error, ((0, 0), (0, POSE)))
         return self._moved(F, noise)
 
     def leaving_here(self, W: Array) -> Covariance:
-        """The pose is that of the last leaving; its error W (6, 6) times [r, φ] displaces the world."""
+        """The pose that landmarks leave is the present one now; its error W (6, 6) times [r, φ] displaces the world."""
         F = np.eye(HEAD)
-        F[-POSE:, -POSE:], F[-POSE:, :POSE] = 0.0, W
-        return self._moved(F, 0.0)
+        F[LEAVING, LEAVING], F[LEAVING, :POSE] = 0.0, W
+        return changed(self._moved(F), apart=changed(self.apart, way=self.apart.way + self.way(W)))
 
     def way(self, W: Array) -> Array:
-        """Of the error (6,) of the displacement of the world from the last leaving until now, W (6, 6) times [r, φ]."""
-        now, then, P = slice(POSE), slice(HEAD - POSE, HEAD), self.P
-        D = W @ P[now, then]
-        D = W @ P[now, now] @ W.T - D - D.T + P[then, then]
+        """Of the change (6,) of the displacement of the world from the pose that landmarks left until now, W [r, φ]."""
+        D = W @ self.P[:POSE, LEAVING]
+        D = W @ self.pose @ W.T - D - D.T + self.P[LEAVING, LEAVING]
         return np.asarray(0.5 * (D + D.T))
 
-    def _moved(self, F: Array, noise: Array | float) -> Covariance:
+    def _moved(self, F: Array, noise: Array | float = 0.0) -> Covariance:
         P, by_rig = self.P.copy(), self.by_rig.copy()
         P[:HEAD], by_rig[:HEAD] = F @ P[:HEAD], F @ by_rig[:HEAD]
         own = P[:HEAD, :HEAD] @ F.T

@@ -8,13 +8,14 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from backends.ekf.camera import Camera, Motion, displacement, pose_by_error, transport
-from backends.ekf.covariance import HEAD, POSE, Apart, Covariance
+from backends.ekf.covariance import HEAD, LEAVING, POSE, Apart, Covariance
 from backends.ekf.innovation import Correction
 from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
 from slam.data import IdArray, IndexArray
 from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array
 
+_AS_WELL = 2.0  # share of variance: landmarks that leave may be so much more uncertain as seen from the last leaving
 _AT_ONCE = 8  # cost: one of so many landmarks leaves at once, so that the matrix is not copied in every frame
 
 
@@ -23,11 +24,12 @@ class FilterState:
     """A camera and three coordinates per landmark, with the joint covariance of their errors.
 
     Landmarks that were measured long ago leave the matrix. They stay in the map, where they were, with their covariance
-    in the world. As seen from the camera, they are as uncertain as when they left, plus what its way since adds, as a
-    displacement of the world. The pose of the last leaving is in the state, so its covariance is known from there on;
-    those from one leaving to the next are added as if they were independent. So are they predicted, and so do those
-    that are measured again join, as new ones would: independent of the pose as seen from the camera. They tell it
-    nothing of the past, and nothing is counted twice.
+    in the world. As seen from the camera, they are as uncertain as seen from a pose that they left, plus what the way
+    from there adds, as a displacement of the world. That pose stays in the state, so the covariance of the way is
+    known; it is the present one of a leaving, until landmarks that leave are seen from it no more. The ways from one
+    such pose to the next are added as if they were independent. So are they predicted, and so do those that are
+    measured again join, as new ones would: independent of the pose as seen from the camera. They tell it nothing of
+    the past, and nothing is counted twice.
     """
 
     stamp: float  # time [s]; NaN before the first prediction
@@ -65,12 +67,12 @@ class FilterState:
         """Covariances (M, 3, 3) of landmarks' errors, in their coordinates, as seen from the camera."""
         (own, cross, _), G = self.covariance.marginals(rows), self.landmarks.gauge[rows]
         B, count = G @ displacement(self.camera), self.covariance.correlated
-        own += (B @ self.covariance.pose - 2 * cross) @ B.transpose(0, 2, 1)
+        seen = _as_seen(own, cross, self.covariance.pose, B)
         left = (rows >= count) & ~self.landmarks.known[rows]
         if left.any():
             apart, G = self.covariance.apart.select(rows[left] - count), G[left]
-            own[left] = apart.seen + G @ (apart.way + self._way()) @ G.transpose(0, 2, 1)
-        return np.asarray(0.5 * (own + own.transpose(0, 2, 1)))
+            seen[left] = apart.seen + G @ (apart.way + self._way()) @ G.transpose(0, 2, 1)
+        return seen
 
     def slid(self, slide: Slide, rows: IndexArray, r: Array) -> FilterState:
         """With landmarks of some rows (M,) of the state seen from r (3,), and their features slid there."""
@@ -135,11 +137,13 @@ class FilterState:
         rows = np.sort(may[oldest[last[oldest] < self.frame]])
         if not len(rows):
             return self
-        (own, _, by_rig), seen = self.covariance.marginals(rows), self.from_camera(rows)
-        s, left = self._without(rows), Apart(own, seen, np.zeros((len(rows), POSE, POSE)), by_rig)
-        apart = changed(s.covariance.apart, way=s.covariance.apart.way + self._way())
-        covariance = changed(s.covariance.leaving_here(displacement(self.camera)), apart=apart)
-        return changed(s, covariance=covariance)._with_apart(self.landmarks.select(rows), left)
+        s, covariance, G, here = self, self.covariance, self.landmarks.gauge[rows], self.from_camera(rows)
+        own, _, by_rig = covariance.marginals(rows)
+        seen = _as_seen(own, covariance.P[covariance.numbers(rows), LEAVING], covariance.P[LEAVING, LEAVING], G)
+        if not len(covariance.apart) or np.trace(np.linalg.solve(here, seen), axis1=1, axis2=2).mean() > 3 * _AS_WELL:
+            s, seen = changed(self, covariance=covariance.leaving_here(displacement(self.camera))), here
+        left = Apart(own, seen, np.zeros((len(rows), POSE, POSE)), by_rig)
+        return s._without(rows)._with_apart(self.landmarks.select(rows), left)
 
     def _way(self) -> Array:
         """Covariance (6, 6) of the camera's way since the last leaving."""
@@ -189,7 +193,8 @@ class FilterState:
     def displaced(self, coordinates: Coordinates, ids: IdArray, points: Array) -> FilterState:
         """With some landmarks at points (M, 3) [m]: their error stays, and the covariance is transported as above.
 
-        What moves them is an error of the rig, the last that is considered, and none of the state's.
+        What moves them is an error of the rig, the last that is considered, and none of the state's. Of those that have
+        left, it is kept as seen from a camera, and so transported already.
         """
         rows, before = self.landmarks.rows_of(ids), self.landmarks
         marks = before.moved(coordinates, rows, coordinates.of(before.anchors[rows], points) - before.c[rows])
@@ -202,6 +207,15 @@ class FilterState:
         """What is added to the errors (N, 3, 6) of landmarks that have moved, by the error of the pose."""
         change = (marks.gauge - self.landmarks.gauge)[: self.covariance.correlated]
         return np.asarray(change @ displacement(camera) if camera.transports else np.zeros_like(change))
+
+
+def _as_seen(own: Array, cross: Array, P: Array, B: Array) -> Array:
+    """Covariances (M, 3, 3) of landmarks' errors as seen from a pose.
+
+    Its error (6,) has the covariance P, and with theirs `cross` (M, 3, 6). It takes landmarks along by B (M, 3, 6).
+    """
+    seen = own + (B @ P - 2 * cross) @ B.transpose(0, 2, 1)
+    return np.asarray(0.5 * (seen + seen.transpose(0, 2, 1)))
 
 
 def _block_diagonal(blocks: Array) -> Array:
