@@ -109,39 +109,35 @@ class Covariance:
 
     # --- the camera moves ---
 
-    def camera_moved(self, J: Array, noise: Array) -> Covariance:
-        """The camera's error (12,) becomes J times what it was, plus noise (12, 12)."""
-        F = np.eye(HEAD)
-        F[:CAMERA, :CAMERA] = J
-        return self._moved(F, noise)
-
-    def advanced(self, J: Array, noise: Array, by_error: Array) -> Covariance:
-        """The same; `by_error` (6, 6) times [r, φ], the pose before, is the first of the last ones; the oldest goes."""
-        F = np.eye(HEAD, k=-POSE)
-        F[:CAMERA, :CAMERA], F[LEAVING], F[LEAVING, LEAVING] = J, 0.0, np.eye(POSE)
-        F[CAMERA : CAMERA + POSE, :CAMERA] = np.pad(by_error, ((0, 0), (0, POSE)))
-        return self._moved(F, noise)
-
-    def leaving_here(self, W: Array) -> Covariance:
-        """The pose that landmarks leave is the present one now; its error W (6, 6) times [r, φ] displaces the world."""
-        F = np.eye(HEAD)
-        F[LEAVING, LEAVING], F[LEAVING, :POSE] = 0.0, W
-        return changed(self._moved(F), apart=changed(self.apart, way=self.apart.way + self.way(W)))
-
-    def way(self, W: Array) -> Array:
-        """Of the change (6,) of the displacement of the world from the pose that landmarks left until now, W [r, φ]."""
-        D = W @ self.P[:POSE, LEAVING]
-        D = W @ self.pose @ W.T - D - D.T + self.P[LEAVING, LEAVING]
-        return np.asarray(0.5 * (D + D.T))
-
-    def _moved(self, F: Array, noise: Array | float = 0.0) -> Covariance:
-        P, by_rig = self.P.copy(), self.by_rig.copy()
+    def camera_moved(self, J: Array, noise: Array | float = 0.0) -> Covariance:
+        """The camera's error (12,), or with that of past poses, becomes J times what it was, plus noise (12, 12)."""
+        F, P, by_rig = np.eye(HEAD), self.P.copy(), self.by_rig.copy()
+        F[: len(J), : len(J)] = J
         P[:HEAD], by_rig[:HEAD] = F @ P[:HEAD], F @ by_rig[:HEAD]
         own = P[:HEAD, :HEAD] @ F.T
         own[:CAMERA, :CAMERA] += noise
         P[:HEAD, :HEAD] = 0.5 * (own + own.T)
         P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
         return changed(self, P=P, by_rig=by_rig)
+
+    def advanced(self, J: Array, noise: Array, by_error: Array) -> Covariance:
+        """The same; `by_error` (6, 6) times [r, φ], the pose before, is the first of the last ones; the oldest goes."""
+        F = np.eye(HEAD, k=-POSE)
+        F[:CAMERA, :CAMERA], F[LEAVING], F[LEAVING, LEAVING] = J, 0.0, np.eye(POSE)
+        F[CAMERA : CAMERA + POSE, :CAMERA] = np.pad(by_error, ((0, 0), (0, POSE)))
+        return self.camera_moved(F, noise)
+
+    def leaving_here(self, W: Array) -> Covariance:
+        """The pose that landmarks leave is the present one now; its error W (6, 6) times [r, φ] displaces the world."""
+        F = np.eye(HEAD)
+        F[LEAVING, LEAVING], F[LEAVING, :POSE] = 0.0, W
+        return changed(self.camera_moved(F), apart=changed(self.apart, way=self.apart.way + self.way(W)))
+
+    def way(self, W: Array) -> Array:
+        """Of the change (6,) of the displacement of the world from the pose that landmarks left until now, W [r, φ]."""
+        D = W @ self.P[:POSE, LEAVING]
+        D = W @ self.pose @ W.T - D - D.T + self.P[LEAVING, LEAVING]
+        return np.asarray(0.5 * (D + D.T))
 
     def walked(self, rows: IndexArray, walk: Array) -> Covariance:
         """After landmarks (`rows` (M,) of the table, none of those that are apart) walk by (M, 3, 3)."""
