@@ -238,7 +238,7 @@ class Correction:
         ``Q_j⁻¹ y_j``, with covariance ``Q_j⁻¹``: the distance is ``y_jᵀ Q_j⁻¹ y_j``. Those that are not used are off by
         ``ν_b − S_ba S_aa⁻¹ ν_a``, with covariance ``S_bb − S_ba S_aa⁻¹ S_ab``. One that is not seen has distance 0.
         """
-        used, at, columns = self.used, self.at, self.L_inverse.reshape(len(self.taken), -1, 3)
+        used, at, columns = self.used, self.at, self.L_inverse.reshape(len(self.taken), len(self.taken) // 3, 3)
         off, blocks, others = self.y.reshape(-1, 3).copy(), np.empty((len(used), 3, 3)), np.repeat(~used, 3)
         blocks[used] = columns.transpose(1, 2, 0) @ columns.transpose(1, 0, 2)
         if others.any():
