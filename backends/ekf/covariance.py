@@ -1,8 +1,8 @@
 """The filter's covariance: of the camera, its last poses and the landmarks, one dense matrix.
 
-The last poses are corrected no more: they stay as they were believed in their time (stochastic clones). Their errors'
+The past poses are corrected no more: they stay as they were believed in their time (stochastic clones). Their errors'
 covariance with the others goes on, as in the filter of Schmidt, which is exact for what it does: with a gain of zero
-``P_ab ← (1 − K H) P_ab`` and ``P_bb`` stays.
+``P_ab ← (1 − K H) P_ab`` and ``P_bb`` stays. They are the last poses, and the one that landmarks left.
 Landmarks that are independent of all else until they are measured are apart from the matrix: those that are known from
 elsewhere, and those that were measured so long ago that they have left it.
 
@@ -26,7 +26,8 @@ from slam.runtime.compilation import kernel
 CAMERA = 12  #: fixed: size of the camera's state [r, φ, v, ω]
 POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 RECENT = 4  #: cost: poses before the present one that are kept
-HEAD = CAMERA + POSE * RECENT  #: fixed: size of camera and last poses, behind which the landmarks stand
+HEAD = CAMERA + POSE * (RECENT + 1)  #: fixed: size of camera and past poses, behind which the landmarks stand
+LEAVING = slice(HEAD - POSE, HEAD)  #: fixed: where the last of these stands, the pose that landmarks left
 _BLOCK = 32  # cost: rows and columns that are mirrored at once
 
 
@@ -35,8 +36,8 @@ class Apart(Table):
     """What is known of the coordinates of landmarks (C,) that are independent of all else."""
 
     own: Array  # covariances (C, 3, 3)
-    seen: Array  # of those that have left, covariances (C, 3, 3) of the error as seen from the camera of that time
-    since: Array  # and what that had travelled (C, 6, 6); see `backends.ekf.state.FilterState`
+    seen: Array  # of those that have left, covariances (C, 3, 3) of the error as seen from a pose that they left
+    way: Array  # and of the way from that to the last such pose (C, 6, 6); see `backends.ekf.state.FilterState`
     by_rig: Array  # derivatives (C, 3, m) by errors of the rig
 
     @classmethod
@@ -47,9 +48,10 @@ class Apart(Table):
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Of ``[camera (12), last poses (24), N landmarks (3N)]``, n numbers.
+    """Of ``[camera (12), last poses (24), the pose that landmarks left (6), N landmarks (3N)]``, n numbers.
 
-    The poses are perturbed on the right, the newest first; zero before there are so many. Rows of the table of
+    The last poses are perturbed on the right, the newest first; zero before there are so many. The error of the pose
+    that landmarks left is a displacement of the world; see `backends.ekf.state.FilterState`. Rows of the table of
     landmarks are in this order; behind them are those that are apart.
     """
 
@@ -107,22 +109,35 @@ class Covariance:
 
     # --- the camera moves ---
 
-    def camera_moved(self, J: Array, noise: Array, by_error: Array | None = None) -> Covariance:
-        """The camera's error (12,) becomes J times what it was, plus noise (12, 12).
-
-        With `by_error`, the pose before, that (6, 6) times [r, φ], is now the first of the last ones; the last goes.
-        """
-        F = np.eye(HEAD) if by_error is None else np.eye(HEAD, k=-POSE)
-        F[:CAMERA, :CAMERA] = J
-        if by_error is not None:
-            F[CAMERA : CAMERA + POSE, :POSE], F[CAMERA : CAMERA + POSE, POSE:CAMERA] = by_error, 0.0
-        P, by_rig = self.P.copy(), self.by_rig.copy()
+    def camera_moved(self, J: Array, noise: Array | float = 0.0) -> Covariance:
+        """The camera's error (12,), or with that of past poses, becomes J times what it was, plus noise (12, 12)."""
+        F, P, by_rig = np.eye(HEAD), self.P.copy(), self.by_rig.copy()
+        F[: len(J), : len(J)] = J
         P[:HEAD], by_rig[:HEAD] = F @ P[:HEAD], F @ by_rig[:HEAD]
         own = P[:HEAD, :HEAD] @ F.T
         own[:CAMERA, :CAMERA] += noise
         P[:HEAD, :HEAD] = 0.5 * (own + own.T)
         P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
         return changed(self, P=P, by_rig=by_rig)
+
+    def advanced(self, J: Array, noise: Array, by_error: Array) -> Covariance:
+        """The same; `by_error` (6, 6) times [r, φ], the pose before, is the first of the last ones; the oldest goes."""
+        F = np.eye(HEAD, k=-POSE)
+        F[:CAMERA, :CAMERA], F[LEAVING], F[LEAVING, LEAVING] = J, 0.0, np.eye(POSE)
+        F[CAMERA : CAMERA + POSE, :CAMERA] = np.pad(by_error, ((0, 0), (0, POSE)))
+        return self.camera_moved(F, noise)
+
+    def leaving_here(self, W: Array) -> Covariance:
+        """The pose that landmarks leave is the present one now; its error W (6, 6) times [r, φ] displaces the world."""
+        F = np.eye(HEAD)
+        F[LEAVING, LEAVING], F[LEAVING, :POSE] = 0.0, W
+        return changed(self.camera_moved(F), apart=changed(self.apart, way=self.apart.way + self.way(W)))
+
+    def way(self, W: Array) -> Array:
+        """Of the change (6,) of the displacement of the world from the pose that landmarks left until now, W [r, φ]."""
+        D = W @ self.P[:POSE, LEAVING]
+        D = W @ self.pose @ W.T - D - D.T + self.P[LEAVING, LEAVING]
+        return np.asarray(0.5 * (D + D.T))
 
     def walked(self, rows: IndexArray, walk: Array) -> Covariance:
         """After landmarks (`rows` (M,) of the table, none of those that are apart) walk by (M, 3, 3)."""
@@ -157,7 +172,7 @@ class Covariance:
     def corrected(self, V: Array, by_rig: Array, J: Array, shift: Array) -> Covariance:
         """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ`` (paper A, Eq. 11).
 
-        The last poses keep the covariance that they have among themselves.
+        The past poses keep the covariance that they have among themselves.
 
         Args:
             V: ``K S Kᵀ = V Vᵀ`` (n, ·).

@@ -49,7 +49,7 @@ class Update:
         camera, J = self.camera.regular_towards(T)
         if camera is self.camera:
             return self
-        return changed(self, camera=camera, covariance=self.covariance.camera_moved(J, np.zeros((CAMERA, CAMERA))))
+        return changed(self, camera=camera, covariance=self.covariance.camera_moved(J))
 
     @cached_property
     def numbers(self) -> IndexArray:
@@ -162,34 +162,29 @@ class Linearisation:
 
     def solved(self, used: BoolArray) -> Correction:
         """The update by some landmarks (mask (M,)). Raises LinAlgError if S is not positive definite."""
-        order = np.argsort(np.repeat(~used, 3), kind="stable")
+        taken = np.flatnonzero(np.repeat(used, 3))
         # of the transpose, which is in the order that LAPACK wants
-        upper, info = dpotrf(reordered(self.S, order).T, overwrite_a=1)
+        upper, info = dpotrf(reordered(self.S, taken).T, overwrite_a=1)
         if info != 0:
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
-        k, inverse = 3 * np.count_nonzero(used), upper_inverse(upper).T
-        return Correction(self, used, order[:k], order[k:], inverse[:k, :k], inverse[k:, :k], upper[k:, k:].T)
+        return Correction(self, used, taken, upper_inverse(upper).T)
 
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """The update by some of the landmarks, linearised somewhere: K of them.
+    """The update by K of the landmarks, linearised somewhere, with ``S_aa = L Lᵀ`` of their numbers a of z.
 
-    With their numbers a of z before those of the others, b, the corner L_aa of ``S = L Lᵀ`` is their own factor. The
-    others may be off by anything: nothing but their distances depends on them.
+    The others, b, may be off by anything: nothing but their distances depends on them.
     """
 
     at: Linearisation
     used: BoolArray  # which landmarks (M,)
     taken: IndexArray  # a (3K,)
-    others: IndexArray  # b (B,)
-    L_inverse: Array  # (L⁻¹)_aa (3K, 3K), lower triangular
-    beneath: Array  # (L⁻¹)_ba (B, 3K)
-    rest: Array  # L_bb (B, B)
+    L_inverse: Array  # L⁻¹ (3K, 3K), lower triangular
     linear: bool = True  # whether the measurements are so at the solution; not looked at where one linearisation is all
 
     def white(self, X: Array) -> Array:
-        """``L_aa⁻¹ X_a`` (3K, ...) of some columns X (3M, ...)."""
+        """``L⁻¹ X_a`` (3K, ...) of some columns X (3M, ...)."""
         return np.asarray(self.L_inverse @ X[self.taken])
 
     @cached_property
@@ -216,7 +211,7 @@ class Correction:
 
     @cached_property
     def white_pose(self) -> Array:
-        """``L_aa⁻¹ (H P)_a`` of the pose (3K, 6)."""
+        """``L⁻¹ (H P)_a`` of the pose (3K, 6)."""
         return self.white(self.at.HP[:, :POSE])
 
     @cached_property
@@ -241,13 +236,15 @@ class Correction:
 
         With ``y_j`` and ``Q_j = (S⁻¹)_jj`` in the rows j of a landmark that is used, its innovation is off by
         ``Q_j⁻¹ y_j``, with covariance ``Q_j⁻¹``: the distance is ``y_jᵀ Q_j⁻¹ y_j``. Those that are not used are off by
-        ``ν_b + L_bb (L⁻¹)_ba ν_a``, with covariance ``L_bb L_bbᵀ``. A landmark that is not seen has distance 0.
+        ``ν_b − S_ba S_aa⁻¹ ν_a``, with covariance ``S_bb − S_ba S_aa⁻¹ S_ab``. One that is not seen has distance 0.
         """
-        used, nu, columns = self.used, self.at.nu, self.L_inverse.reshape(len(self.taken), len(self.taken) // 3, 3)
-        off, blocks = self.y.reshape(-1, 3).copy(), np.empty((len(used), 3, 3))
-        off[~used] = (nu[self.others] + self.rest @ (self.beneath @ nu[self.taken])).reshape(-1, 3)
+        used, at, columns = self.used, self.at, self.L_inverse.reshape(len(self.taken), len(self.taken) // 3, 3)
+        off, blocks, others = self.y.reshape(-1, 3).copy(), np.empty((len(used), 3, 3)), np.repeat(~used, 3)
         blocks[used] = columns.transpose(1, 2, 0) @ columns.transpose(1, 0, 2)
-        blocks[~used] = diagonal_blocks(self.rest @ self.rest.T)
+        if others.any():
+            W = self.white(at.S[:, others])
+            off[~used] = (at.nu[others] - self.white(at.nu) @ W).reshape(-1, 3)
+            blocks[~used] = diagonal_blocks(at.S[others][:, others] - W.T @ W)
         found = squared_distances(off, blocks)
         if not np.isfinite(found).all():
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")

@@ -8,14 +8,14 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from backends.ekf.camera import Camera, Motion, displacement, pose_by_error, transport
-from backends.ekf.covariance import HEAD, POSE, Apart, Covariance
+from backends.ekf.covariance import HEAD, LEAVING, POSE, Apart, Covariance
 from backends.ekf.innovation import Correction
 from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
 from slam.data import IdArray, IndexArray
 from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array
-from slam.window.stereo import relative_covariance
 
+_AS_WELL = 2.0  # share of variance: landmarks that leave may be so much more uncertain as seen from the last leaving
 _AT_ONCE = 8  # cost: one of so many landmarks leaves at once, so that the matrix is not copied in every frame
 
 
@@ -24,11 +24,12 @@ class FilterState:
     """A camera and three coordinates per landmark, with the joint covariance of their errors.
 
     Landmarks that were measured long ago leave the matrix. They stay in the map, where they were, with their covariance
-    in the world. As seen from the camera, they are as uncertain as when they left, plus what its way since adds: the
-    sum over its steps of their covariances, as if they were independent, each as a displacement of the world. That is
-    too much where it stays among its landmarks, or has found them again after the dark. So are they predicted, and so
-    do those that are measured again join, as new ones would: independent of the pose as seen from the camera. They tell
-    it nothing of the past, and nothing is counted twice.
+    in the world. As seen from the camera, they are as uncertain as seen from a pose that they left, plus what the way
+    from there adds, as a displacement of the world. That pose stays in the state, so the covariance of the way is
+    known; it is the present one of a leaving, until landmarks that leave are seen from it no more. The ways from one
+    such pose to the next are added as if they were independent. So are they predicted, and so do those that are
+    measured again join, as new ones would: independent of the pose as seen from the camera. They tell it nothing of
+    the past, and nothing is counted twice.
     """
 
     stamp: float  # time [s]; NaN before the first prediction
@@ -37,14 +38,11 @@ class FilterState:
     camera: Camera
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of everything
-    before: Array  # the pose (4, 4) of the prediction before
-    travelled: Array  # what the camera had travelled then (6, 6)
 
     @classmethod
     def first(cls, camera: Camera, P: Array) -> FilterState:
         """Before the first prediction, with the covariance (12, 12) of the camera's error."""
-        covariance, still = Covariance.of_camera(P), np.zeros((POSE, POSE))
-        return cls(float("nan"), -1, True, camera, FilterLandmarks.none(), covariance, camera.pose, still)
+        return cls(float("nan"), -1, True, camera, FilterLandmarks.none(), Covariance.of_camera(P))
 
     # --- the camera ---
 
@@ -62,34 +60,19 @@ class FilterState:
     def advanced(self, stamp: float, motion: Motion) -> FilterState:
         """At a later time, after a motion of the camera."""
         camera, J, noise = motion
-        covariance = self.covariance.camera_moved(J, noise, pose_by_error(self.camera))
-        travelled = self.travelled_now() if len(covariance.apart) else self.travelled  # it is counted once one has left
-        return FilterState(stamp, self.frame + 1, False, camera, self.landmarks, covariance, self.pose, travelled)
-
-    def travelled_now(self) -> Array:
-        """What the camera has travelled by now (6, 6).
-
-        Steps in a row that no landmark measures err alike, as their velocity does: their deviations add up, those
-        before being at most as large as the last.
-        """
-        if self.frame < 1:
-            return self.travelled
-        unmeasured = max(self.frame - int(self.landmarks.last.max(initial=-1)), 1)
-        J = pose_by_error(self.camera)
-        step = relative_covariance(self.covariance.joint_poses(J, 2), self.before, self.pose)
-        D = np.linalg.solve(J.T, displacement(self.camera).T).T
-        return np.asarray(self.travelled + (2 * unmeasured - 1) * (D @ step @ D.T))
+        covariance = self.covariance.advanced(J, noise, pose_by_error(self.camera))
+        return FilterState(stamp, self.frame + 1, False, camera, self.landmarks, covariance)
 
     def from_camera(self, rows: IndexArray) -> Array:
         """Covariances (M, 3, 3) of landmarks' errors, in their coordinates, as seen from the camera."""
         (own, cross, _), G = self.covariance.marginals(rows), self.landmarks.gauge[rows]
         B, count = G @ displacement(self.camera), self.covariance.correlated
-        own += (B @ self.covariance.pose - 2 * cross) @ B.transpose(0, 2, 1)
+        seen = _as_seen(own, cross, self.covariance.pose, B)
         left = (rows >= count) & ~self.landmarks.known[rows]
         if left.any():
             apart, G = self.covariance.apart.select(rows[left] - count), G[left]
-            own[left] = apart.seen + G @ (self.travelled_now() - apart.since) @ G.transpose(0, 2, 1)
-        return np.asarray(0.5 * (own + own.transpose(0, 2, 1)))
+            seen[left] = apart.seen + G @ (apart.way + self._way()) @ G.transpose(0, 2, 1)
+        return seen
 
     def slid(self, slide: Slide, rows: IndexArray, r: Array) -> FilterState:
         """With landmarks of some rows (M,) of the state seen from r (3,), and their features slid there."""
@@ -136,7 +119,7 @@ class FilterState:
             return self
         apart, new = self.covariance.apart.select(rows - self.covariance.correlated), self.landmarks.select(rows)
         G = np.where(new.known[:, None, None], 0.0, new.gauge)
-        way = (G @ (self.travelled_now() - apart.since)).reshape(-1, POSE) @ G.reshape(-1, POSE).T
+        way = (G @ (apart.way + self._way())).reshape(-1, POSE) @ G.reshape(-1, POSE).T
         noise = _block_diagonal(apart.seen) + np.tril(way) + np.tril(way, -1).T
         s = self._without(rows)
         return s._with(new, s.covariance.appended(G @ displacement(self.camera), noise, apart.by_rig))
@@ -154,9 +137,17 @@ class FilterState:
         rows = np.sort(may[oldest[last[oldest] < self.frame]])
         if not len(rows):
             return self
-        since, (own, _, by_rig) = np.tile(self.travelled_now(), (len(rows), 1, 1)), self.covariance.marginals(rows)
-        left = Apart(own, self.from_camera(rows), since, by_rig)
-        return self._without(rows)._with_apart(self.landmarks.select(rows), left)
+        s, covariance, G, here = self, self.covariance, self.landmarks.gauge[rows], self.from_camera(rows)
+        own, _, by_rig = covariance.marginals(rows)
+        seen = _as_seen(own, covariance.P[covariance.numbers(rows), LEAVING], covariance.P[LEAVING, LEAVING], G)
+        if not len(covariance.apart) or np.trace(np.linalg.solve(here, seen), axis1=1, axis2=2).mean() > 3 * _AS_WELL:
+            s, seen = changed(self, covariance=covariance.leaving_here(displacement(self.camera))), here
+        left = Apart(own, seen, np.zeros((len(rows), POSE, POSE)), by_rig)
+        return s._without(rows)._with_apart(self.landmarks.select(rows), left)
+
+    def _way(self) -> Array:
+        """Covariance (6, 6) of the camera's way since the last leaving."""
+        return self.covariance.way(displacement(self.camera))
 
     def _without(self, gone: IndexArray) -> FilterState:
         """Without the landmarks of some rows of the table."""
@@ -202,7 +193,8 @@ class FilterState:
     def displaced(self, coordinates: Coordinates, ids: IdArray, points: Array) -> FilterState:
         """With some landmarks at points (M, 3) [m]: their error stays, and the covariance is transported as above.
 
-        What moves them is an error of the rig, the last that is considered, and none of the state's.
+        What moves them is an error of the rig, the last that is considered, and none of the state's. Of those that have
+        left, it is kept as seen from a camera, and so transported already.
         """
         rows, before = self.landmarks.rows_of(ids), self.landmarks
         marks = before.moved(coordinates, rows, coordinates.of(before.anchors[rows], points) - before.c[rows])
@@ -215,6 +207,15 @@ class FilterState:
         """What is added to the errors (N, 3, 6) of landmarks that have moved, by the error of the pose."""
         change = (marks.gauge - self.landmarks.gauge)[: self.covariance.correlated]
         return np.asarray(change @ displacement(camera) if camera.transports else np.zeros_like(change))
+
+
+def _as_seen(own: Array, cross: Array, P: Array, B: Array) -> Array:
+    """Covariances (M, 3, 3) of landmarks' errors as seen from a pose.
+
+    Its error (6,) has the covariance P, and with theirs `cross` (M, 3, 6). It takes landmarks along by B (M, 3, 6).
+    """
+    seen = own + (B @ P - 2 * cross) @ B.transpose(0, 2, 1)
+    return np.asarray(0.5 * (seen + seen.transpose(0, 2, 1)))
 
 
 def _block_diagonal(blocks: Array) -> Array:

@@ -88,27 +88,59 @@ def test_one_that_is_measured_again_is_new_to_the_camera(name):
     G, H = s.landmarks.gauge[rows], np.eye(len(s.covariance.P))[at]
     H[:, :6] = -(G @ displacement(s.camera)).reshape(-1, 6)
     np.testing.assert_allclose(H @ s.covariance.P[:, :6], 0, atol=1e-12)
-    # nor do many together know where the camera was when the last of them left, better than by its way since
+    # nor do many together know where the pose is that the last of them left, better than by the way from there
     half = len(ids) // 2
     U, E = G[:half].reshape(-1, 6), H[: 3 * half]
     known = np.linalg.inv(U.T @ np.linalg.solve(E @ s.covariance.P @ E.T, U))
-    way = s.travelled_now() - apart.since[half - 1]
+    way = s.covariance.way(displacement(s.camera)) + apart.way[half - 1]
     assert half > 50 and np.linalg.eigvals(np.linalg.solve(way, known)).real.min() > 1.0
 
 
+def uncertain(backend, ids) -> np.ndarray:
+    """Of landmarks: the deviations [rad] of their directions as seen from the camera."""
+    found = backend.state.from_camera(backend.state.landmarks.rows_of(ids))
+    return np.sqrt(np.trace(found[:, :2, :2], axis1=1, axis2=2))
+
+
 @BOTH
-@pytest.mark.parametrize("dark", [3, 10, 30])
-def test_in_the_dark_one_that_has_left_is_no_better_known_than_one_that_stayed(name, dark):
-    found = []
+@pytest.mark.parametrize("dark", [1, 3, 10, 30])
+def test_in_the_dark_one_that_has_left_is_as_uncertain_as_one_that_stayed(name, dark):
+    """And once the camera has seen others again, hardly more."""
+    found, again = [], []
     for leave in (True, False):
-        backend, *_ = swayed(name, 40, kept=None)
+        backend, _, _, sights = swayed(name, 40, kept=None)
         ids = left(backend.state.with_most(KEPT))
         backend.state = backend.state.with_most(KEPT) if leave else backend.state
         for k in range(dark):
             backend.predict(DT * (40 + k))
-        found.append(backend.state.from_camera(backend.state.landmarks.rows_of(ids)))
-    ratio = np.trace(found[0], axis1=1, axis2=2) / np.trace(found[1], axis1=1, axis2=2)
-    assert len(ratio) > 50 and ratio.min() > 1.0 and ratio.max() < 2.0**2
+        found.append(uncertain(backend, ids))
+        backend.predict(DT * (40 + dark))
+        backend.update(sights[39].select(~np.isin(sights[39].ids, ids)))
+        again.append(uncertain(backend, ids))
+    assert len(ids) > 50
+    np.testing.assert_allclose(found[0], found[1], rtol=0.01)
+    ratio = again[0] / again[1]
+    assert ratio.min() > 0.9 and np.median(ratio) < 1.6
+
+
+@BOTH
+@pytest.mark.parametrize("frames", [25, 40])
+def test_a_camera_that_hovers_knows_where_those_that_have_left_are(name, frames):
+    """Hardly worse than if they had stayed, though others go on to leave, and no worse with time."""
+    found: list[np.ndarray] = []
+    ids = np.arange(500)
+    for kept in (KEPT, None):
+        backend, poses, points, _ = swayed(name, frames, kept=kept)
+        known, rng = set(backend.state.landmarks.ids.tolist()), np.random.default_rng(5)
+        ids = np.intersect1d(ids, left(backend.state)) if kept else ids
+        for k in range(30):
+            T = poses[frames - 1].copy()
+            T[0, 3] += 0.01 * np.sin(0.3 * k)
+            step(backend, DT * (frames + k), observe(T, points, MODELS.pixel_sigma, rng, 40), known)
+        ids = np.intersect1d(ids, left(backend.state)) if kept else ids
+        found.append(uncertain(backend, ids))
+    ratio = found[0] / found[1]
+    assert len(ids) > 30 and ratio.min() > 0.9 and np.median(ratio) < 1.5
 
 
 @BOTH

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from backends.ekf.backend import EkfConfig
 from backends.ekf.camera import displacement, from_body_axes, pose_by_error, predicted, prior
-from backends.ekf.covariance import CAMERA, HEAD, Apart, Covariance
+from backends.ekf.covariance import CAMERA, HEAD, LEAVING, Apart, Covariance
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth, Slide
 from backends.ekf.motion import EulerCamera
@@ -155,13 +155,17 @@ def test_landmarks_move_between_the_parts():
 
 
 def advanced(covariance: Covariance, P: np.ndarray, rng) -> tuple[Covariance, np.ndarray]:
-    """After five motions of the camera, by which four of its poses are kept."""
+    """After landmarks left and five motions of the camera, by which its pose of then and the last four are kept."""
+    W, F = rng.standard_normal((6, 6)), np.eye(len(P))
+    F[LEAVING, :6], F[LEAVING, LEAVING] = W, 0.0
+    covariance, P = covariance.leaving_here(W), F @ P @ F.T
     for _ in range(5):
         pose, J, noise = rng.standard_normal((6, 6)), rng.standard_normal((12, 12)), positive(12, rng)
         F = np.eye(len(P))
         F[:HEAD, :HEAD] = np.eye(HEAD, k=-6)
         F[:12, :12], F[12:18, :6], F[12:18, 6:12] = J, pose, 0.0
-        covariance, P = covariance.camera_moved(J, noise, pose), F @ P @ F.T
+        F[LEAVING, :HEAD], F[LEAVING, LEAVING] = 0.0, np.eye(6)
+        covariance, P = covariance.advanced(J, noise, pose), F @ P @ F.T
         P[:12, :12] += noise
     return covariance, P
 
@@ -176,6 +180,10 @@ def test_the_last_poses_are_kept():
     assert_equal_to_rounding(whole(back), P[np.ix_(g, g)])
     order = np.r_[18:24, 12:18, :6]
     assert_equal_to_rounding(back.joint_poses(np.eye(6), 3), P[np.ix_(order, order)])
+    W = rng.standard_normal((6, 6))
+    way = np.zeros((6, len(P)))
+    way[:, :6], way[:, LEAVING] = W, -np.eye(6)
+    assert_equal_to_rounding(back.way(W), way @ P @ way.T)
 
 
 def test_a_correction_and_its_transport():
