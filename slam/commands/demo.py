@@ -17,9 +17,9 @@ from slam.run.drawing import draw_objects, with_legend
 from slam.run.options import RunOptions
 from slam.run.plots import PICTURE, plot
 from slam.run.run_data import RunData
+from slam.run.run_record import RunRecord
 from slam.run.runner import run
 from slam.run.schema import FILES
-from slam.run.summary import RunRecord
 from slam.run.warm_up import compile_kernels
 from slam.sequences import open_sequence
 

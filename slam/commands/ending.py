@@ -16,7 +16,7 @@ from slam.files import reason
 from slam.run.until import Until
 
 if TYPE_CHECKING:
-    from slam.run.summary import RunRecord
+    from slam.run.run_record import RunRecord
 
 #: Signals that end a run with all its files: Ctrl-C, a request to end, a closed terminal.
 _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]

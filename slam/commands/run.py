@@ -26,8 +26,8 @@ from slam.run import viewer as viewing
 from slam.run.options import RunOptions, parse_frames
 from slam.run.plots import leave_picture
 from slam.run.recording import Recording, load_recording
+from slam.run.run_record import RunRecord
 from slam.run.runner import run, run_recording
-from slam.run.summary import RunRecord
 from slam.run.warm_up import compile_kernels
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import format_of, is_live, open_sequence

@@ -25,7 +25,7 @@ from slam.files import noting_inputs, read_object
 from slam.input.features import Rectification
 from slam.outputs import Output, require_outputs
 from slam.run.options import versions
-from slam.run.outputs import naming_folder, write_json
+from slam.run.run_files import naming_folder, write_json
 from slam.sequences import open_sequence
 
 RUNS, SWEEP = "runs", "sweep.json"

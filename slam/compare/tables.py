@@ -19,7 +19,6 @@ from slam.compare.trial import Run
 from slam.files import read_object, write_text
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import pair
-from slam.run.outputs import csv_number, csv_rows
 from slam.run.results import (
     COMPARED,
     DOUBTED,
@@ -32,6 +31,7 @@ from slam.run.results import (
     verdict_of_run,
 )
 from slam.run.run_data import RunData
+from slam.run.run_files import csv_number, csv_rows
 
 DIFFERENCE_COLUMNS = (
     "sequence", "mode", "figure", "reference", "other", "pairs", "missing", "mean_reference", "mean_other",

@@ -20,13 +20,13 @@ from slam.files import read_object, remove_file
 from slam.geometry.se3 import Array, nearest_rotation
 from slam.geometry.stamps import frame_range, pair
 from slam.run.options import RunOptions, versions
-from slam.run.outputs import naming_folder, write_json
 from slam.run.recording import load_recording
 from slam.run.results import DOUBTED, figures
 from slam.run.run_data import RunData
+from slam.run.run_files import naming_folder, write_json
+from slam.run.run_record import RunRecord
 from slam.run.runner import run as run_sequence
 from slam.run.runner import run_recording
-from slam.run.summary import RunRecord
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
 from slam.worlds import WorldSequence

@@ -17,7 +17,7 @@ from slam.errors import CalibrationError, ConfigurationError
 from slam.geometry.rig import rig_difference, rig_numbers
 from slam.geometry.se3 import Array
 from slam.outputs import Output, require_outputs
-from slam.run.outputs import write_json
+from slam.run.run_files import write_json
 from slam.runtime.threads import one_blas_thread
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import is_live

@@ -19,7 +19,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.object_data import MovingObject
 from slam.outputs import Output
-from slam.run.outputs import naming_folder
+from slam.run.run_files import naming_folder
 from slam.run.schema import body_colour
 
 _BEACON, _NEW, _MOVING, _RING = (0, 230, 255), (80, 200, 80), (0, 0, 0), (255, 255, 255)  # BGR, as all colours here

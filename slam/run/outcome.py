@@ -14,7 +14,7 @@ from slam.geometry.se3 import Array, inverse, log
 from slam.input.warnings import REPEATED
 from slam.models import MotionModel
 from slam.run.options import RunOptions
-from slam.run.summary import RunRecord
+from slam.run.run_record import RunRecord
 from slam.tracks.step import ENOUGH_FEATURES, HIDDEN
 
 _TRACKED, _STARTED = "tracked", "started"

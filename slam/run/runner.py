@@ -1,4 +1,4 @@
-"""Run a sequence through the system and write the files of `slam.run.outputs`; the algorithm is in `slam.system`."""
+"""Run a sequence through the system and write the files of `slam.run.run_files`; the algorithm is in `slam.system`."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from slam.interfaces import Frontend
 from slam.outputs import require_outputs
 from slam.run.options import RunOptions, origin, versions
 from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
-from slam.run.outputs import RunFiles, write_json
 from slam.run.recording import RecordedFrame, Recording, save_recording
 from slam.run.replay import Replay
+from slam.run.run_files import RunFiles, write_json
+from slam.run.run_record import RunRecord, live_frames, results_of
 from slam.run.schema import schema
-from slam.run.summary import RunRecord, live_frames, results_of
 from slam.run.until import Until
 from slam.run.warm_up import warm_up
 from slam.runtime.threads import one_blas_thread

@@ -17,7 +17,7 @@ from slam.models import MotionModel
 from slam.outputs import Output
 from slam.run.options import RunOptions
 from slam.run.outcome import motion_doubt, outcome, scale_doubt
-from slam.run.summary import RunRecord
+from slam.run.run_record import RunRecord
 from tests.slam.numeric import chained
 
 OPTIONS = RunOptions("ekf", "surf", SystemConfig())

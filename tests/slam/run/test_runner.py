@@ -23,8 +23,8 @@ from slam.run import schema
 from slam.run.options import RunOptions
 from slam.run.recording import load_recording
 from slam.run.run_data import RunData
+from slam.run.run_record import RunRecord
 from slam.run.runner import run
-from slam.run.summary import RunRecord
 from slam.sequences import open_sequence
 from tests.failing_runs import FRAMES, Features, Scripted
 

@@ -11,7 +11,7 @@ from slam.config import SystemConfig
 from slam.geometry.se3 import pose, rotation
 from slam.object_data import MovingObject, ObjectEstimate
 from slam.run.options import RunOptions
-from slam.run.outputs import RunFiles
+from slam.run.run_files import RunFiles
 from slam.run.runner import run
 from slam.run.schema import FILES, OLD_LANDMARKS, TABLES, header
 from slam.sequences import open_sequence

@@ -12,7 +12,7 @@ from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import exp
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.run.results import figures
-from slam.run.summary import RunRecord, results_of
+from slam.run.run_record import RunRecord, results_of
 from tests.slam.numeric import chained
 
 N, SIGMA = 120, 0.01
