@@ -176,7 +176,7 @@ class MovingObjectDetector(ObjectDetector):
         """Predict all bodies; forget those not seen for long, and those gone before they were proven."""
         now, dt = frame.features.stamp, frame.dt
         for body in list(self.bodies.values()):
-            if now - body.seen_at > _FORGOTTEN or (body.gone and not body.proven):
+            if now - body.seen_at > _FORGOTTEN or (body.missed > RUN and not body.proven):
                 del self.bodies[body.id]
                 tracks.give_up(np.flatnonzero(tracks.body == body.id))
             else:
@@ -223,7 +223,7 @@ class MovingObjectDetector(ObjectDetector):
             gains, against = said.get(id, (np.zeros(0), 0))
             typical = median(gains) if len(gains) else 0.0
             body = self.bodies[id] = with_evidence(body, typical, int((gains > CLEAR).sum()), against)
-            if id in said and typical <= 0 and not body.proven:
+            if id in said and not body.proven and (typical <= 0 or (body.seen > RUN and not body.rigid)):
                 self._drop(tracks, body)
             elif id in said:
                 mine = np.flatnonzero((tracks.body == id) & tracks.sure)
@@ -259,10 +259,10 @@ class MovingObjectDetector(ObjectDetector):
             scene = scenes[None if whole is None else whole.id]
             moved, way = finder.moved_in(whole, tracks, members, frame), Way.of(body, frame, whole)
             far = body.far or (self.setup.config.size > 0 and body.went > body.across)
-            evidence, counts = with_frame(body.evidence, moved, scene, way, far, both)
-            body = changed(body, evidence=evidence, certain=body.certain + counts, far=far)
+            evidence = with_frame(body.evidence, moved, scene, way, far, both)
+            body = changed(body, evidence=evidence, certain=body.certain or evidence >= way.asked, far=far)
             self.bodies[body.id] = body
-            if evidence == 0.0 if body.proven else body.seen >= 2 * WINDOW:  # the first holds how it started
+            if evidence == 0.0 and (body.proven or body.seen >= WINDOW):  # the window holds how it started
                 self._drop(tracks, body)
 
     def _drop(self, tracks: Tracks, body: Body) -> None:
