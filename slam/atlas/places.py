@@ -18,9 +18,7 @@ from scipy.cluster.vq import kmeans2, vq
 Vectors = NDArray[np.float32]
 
 _LENGTH = 1024  # cost: of a keyframe's vector: 4 kB
-_TRAINING = 50  # cost: descriptors per word from which the words are learnt
 _LEARN_AT = (8, 16, 32, 64, 128)  # cost: numbers of keyframes at which the words are learnt
-_ROUNDS = 10  # numerics: of k-means
 _NONE = 1e-12  # numerics: length below which a vector counts as zero
 
 
@@ -68,12 +66,12 @@ class PlaceIndex:
 
 def learn_words(descriptors: Vectors, number: int) -> Vectors:
     """Centres (number, D) of descriptors (F, D), by k-means on an evenly spaced subset."""
-    some = min(number * _TRAINING, len(descriptors))
+    some = min(50 * number, len(descriptors))  # half or twice as many: the same paths
     descriptors = descriptors[np.linspace(0, len(descriptors) - 1, some).astype(int)]
     first = descriptors[np.linspace(0, some - 1, number).astype(int)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a word without descriptors stays where it is
-        return np.asarray(kmeans2(descriptors, first, iter=_ROUNDS, minit="matrix")[0], np.float32)
+        return np.asarray(kmeans2(descriptors, first, iter=10, minit="matrix")[0], np.float32)
 
 
 def aggregate(descriptors: Vectors, words: Vectors) -> NDArray[np.float32]:
