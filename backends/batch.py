@@ -29,7 +29,6 @@ from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
 from slam.window.stereo import RectifiedStereo
 
-_ITERATIONS = 100  # numerics: of Levenberg-Marquardt at most
 #: numerics: standard deviation [m] of a prior on each landmark; without it far ones go to infinity, and leave the
 #: covariance of everything open
 _FARTHEST = 1e4
@@ -127,7 +126,7 @@ class _BatchSolution:
                 if serial in self.landmarks:
                     problem.factors.add(make.explicit(make.point(z), number, serial))
         self._factors = problem.factors
-        self.values = minimised(problem, _ITERATIONS)
+        self.values = minimised(problem, iterations=100)
         # (F, 4, 4) from its beginning on
         self.poses = np.array([self.values.atPose3(pose_key(number)).matrix() for number in numbers])
 

@@ -46,9 +46,10 @@ KINDS = {
 
 SENSITIVITY = """\
 The columns ½ and 2 are for half and twice the number: the error of the camera's position and of the bodies' motion,
-over that with the default; the worse of two back ends, geometric mean over short runs of {cases} (`python
-experiments/sensitivity.py`). A number changes a result if one of these is beyond the scatter under small perturbations
-of the pixels, factors of {camera:.2f} and {bodies:.2f}, or if a run fails.
+over that with the default; the worst back end, geometric mean over short runs of {cases} (`python
+experiments/sensitivity.py`); of numbers that were measured before the last two were added, over the others. A number
+changes a result if one of these is beyond the scatter under small perturbations of the pixels, factors of {camera:.2f}
+and {bodies:.2f}, or if a run fails.
 """
 
 #: What a number does at half or twice its value, by column of the summary.
@@ -64,11 +65,12 @@ class Parameter:
     value: Any  # a number or a tuple of numbers
     comment: str  # what its author says of it
     kind: str  # one of `KINDS`
+    place: tuple[int, int, int]  # of the value in the file: line from 0, first column, column behind
 
     @property
-    def module(self) -> str:
-        """Dotted name of the module."""
-        return self.file.removesuffix(".py").replace("/", ".")
+    def key(self) -> str:
+        """Dotted name of the module, and the constant's own."""
+        return f"{self.file.removesuffix('.py').replace('/', '.')}:{self.name}"
 
 
 def find(root: Path = ROOT) -> list[Parameter]:
@@ -78,9 +80,9 @@ def find(root: Path = ROOT) -> list[Parameter]:
 
 
 def _of_file(file: Path, name: str) -> list[Parameter]:
-    text = file.read_text(encoding="utf-8")
+    lines = file.read_text(encoding="utf-8").splitlines()
     found = []
-    for node in ast.parse(text).body:
+    for node in ast.parse("\n".join(lines)).body:
         if not isinstance(node, (ast.Assign, ast.AnnAssign)) or node.value is None:
             continue
         target = node.targets[0] if isinstance(node, ast.Assign) else node.target
@@ -89,10 +91,12 @@ def _of_file(file: Path, name: str) -> list[Parameter]:
         for each, value in zip(names, values):
             number = _number(value)
             if number is not None and isinstance(each, ast.Name) and each.id == each.id.upper():
-                comment = _comment(text.splitlines(), node.lineno, node.end_lineno)
+                comment = _comment(lines, node.lineno, node.end_lineno)
                 kind, colon, rest = comment.partition(": ")
                 known = bool(colon) and kind in KINDS
-                found.append(Parameter(name, each.id, number, rest if known else comment, kind if known else "choice"))
+                place = value.lineno - 1, value.col_offset, value.end_col_offset or 0
+                text, kind = (rest, kind) if known else (comment, "choice")
+                found.append(Parameter(name, each.id, number, text, kind, place))
     return found
 
 
@@ -123,7 +127,7 @@ def _comment(lines: list[str], first: int, last: int | None) -> str:
 def page(parameters: list[Parameter], sensitivity: dict[str, Any]) -> str:
     """The page as Markdown: how many numbers of each kind there are, and the choices that change a result."""
     ratios, scatter = sensitivity.get("ratios", {}), sensitivity.get("scatter", {})
-    measured = {p: ratios.get(f"{p.module}:{p.name}") for p in parameters}
+    measured = {p: ratios.get(p.key) for p in parameters}
     lines = [INTRODUCTION, _row(["kind", "what it is", "numbers", *OUTCOMES])]
     lines.append(_row(["---", "---", "---:", *["---:"] * len(OUTCOMES)]))
     for kind, meaning in KINDS.items():
@@ -172,7 +176,7 @@ def main() -> int:
     table = json.loads(arguments.sensitivity.read_text()) if arguments.sensitivity.exists() else {}
     parameters = find()
     if table:
-        present = {f"{p.module}:{p.name}" for p in parameters}
+        present = {p.key for p in parameters}
         table["ratios"] = {name: each for name, each in table["ratios"].items() if name in present}
         arguments.sensitivity.write_text(json.dumps(table, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     arguments.page.write_text(page(parameters, table), encoding="utf-8")

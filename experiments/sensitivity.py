@@ -1,28 +1,27 @@
-"""How much each numeric constant matters: errors at half and at twice its value, over two worlds and a drive.
+"""How much each numeric constant matters: errors at half and at twice its value, over two worlds and three recordings.
 
     SLAM_DATA=/path/to/data python experiments/sensitivity.py [--quick] [--only TEXT] [--out FILE]
 
-Features are extracted once. Each run then gives them to a system in which one constant is changed, and compares the
-camera's path and the moving bodies' motion with the truth. Constants that are compiled into kernels, that are read on
-import, or that belong to the front end are not measured. A constant takes about ten seconds of CPU time. The table is
-written after each, and a later call goes on with those that are missing.
+Each constant is changed in a copy of the program. A process of its own then compares the camera's path and the moving
+bodies' motion with the truth, on features that were extracted once, or again where the constant is the front end's. A
+constant takes half a minute. The table is written after each, and a later call goes on with those that are missing,
+choices first.
 """
 
 from __future__ import annotations
 
 import argparse
-import ast
-import importlib
+import hashlib
 import json
-import signal
+import pickle
+import shutil
+import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -36,107 +35,83 @@ from slam.data import StereoFeatures
 from slam.evaluation.metrics import absolute_errors, associate
 from slam.evaluation.objects import labels_in_images, score_for
 
-BACKENDS = ("ekf", "smoother")
 FACTORS = (0.5, 2.0)
-#: Two worlds with moving bodies, and a drive where the data are there: text, and how many frames of it.
+#: Two worlds with moving bodies, and recordings where the data are there: text, how many frames of it, two back ends.
 CASES = {
-    "box": ("synthetic:box?frames=20", 20),
-    "street": ("synthetic:street?frames=16", 16),
-    **{name: (str(folder), 15) for name, folder in recordings({"KITTI 06": "kitti_odometry/sequences/06"}).items()},
+    "box": ("synthetic:box?frames=20", 20, ("ekf", "window")),
+    "street": ("synthetic:street?frames=16", 16, ("ekf", "smoother")),
+} | {
+    name: (str(folder), 12, {"KITTI 06": ("smoother", "window")}.get(name, ("ekf", "smoother")))
+    for name, folder in recordings(
+        {
+            "KITTI 06": "kitti_odometry/sequences/06",
+            "raw 0013": "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync",
+            "MH_01": "euroc/MH_01_part",
+        }
+    ).items()
 }
 _PERTURBATIONS = 6  # runs of the default with noise, for the scatter
 _PIXEL_NOISE = 0.05  # [px]
 _LOST = 20.0  # times the error of the default: the run has lost its way
-_PATIENCE = 10.0  # times the CPU time of the default, after which a run counts as failed
-_FAILURES = (slam.SlamError, ArithmeticError, ValueError, LookupError, RuntimeError, TimeoutError)
+_PATIENCE = 10.0  # times the default's time, after which a run counts as failed
 _UNCOVERED = 0.5  # share of the default's frames with a body below which bodies count as lost
 _FAILED = {"camera": "fails", "bodies": "fails"}
 
-
-class Errors(NamedTuple):
-    """What a run was off by."""
-
-    camera: float  # RMSE of the online positions [m]
-    bodies: float | None  # RMSE of the bodies' motion from frame to frame [m]; None where the sequence knows of none
-    covered: float  # share of the frames in view in which a body was measured
-    bytes: bytes  # equal for runs that are equal
-    seconds: float  # CPU time
+#: By "case, back end": "camera", RMSE of the online positions [m]; "bodies", RMSE of the bodies' motion from frame to
+#: frame [m], None where none is known; "covered", share of frames in view in which a body was measured; "bytes".
+Errors = dict[str, dict[str, Any]]
 
 
-@cache
-def recorded(case: str) -> tuple[Any, list[StereoFeatures], list[np.ndarray] | None]:
-    """A sequence, the features of its frames, and the body (N,) that each lies on where that is known."""
-    text, frames = CASES[case]
-    sequence = slam.open_sequence(text)
-    frontend = slam.StereoSlam(sequence.rig, backend="ekf", kind=sequence.kind).frontend
-    assert frontend is not None
-    features = [frontend.extract(frame) for frame in sequence.frames(0, frames)]
-    known = score_for(sequence) is not None
-    return sequence, features, [labels_in_images(sequence, k, f) for k, f in enumerate(features)] if known else None
+def recorded(case: str, folder: Path) -> tuple[Any, list[StereoFeatures], list[np.ndarray] | None]:
+    """A sequence, its features, and the body (N,) each lies on where known; from the folder's file, if it is there."""
+    text, frames, _ = CASES[case]
+    sequence, file = slam.open_sequence(text), folder / f"{case}.pickle"
+    if not file.exists():
+        frontend = slam.StereoSlam(sequence.rig, backend="ekf", kind=sequence.kind).frontend
+        assert frontend is not None
+        seen = [frontend.extract(frame) for frame in sequence.frames(0, frames)]
+        known = score_for(sequence) is not None
+        labels = [labels_in_images(sequence, k, f) for k, f in enumerate(seen)] if known else None
+        file.write_bytes(pickle.dumps((seen, labels)))
+    return sequence, *pickle.loads(file.read_bytes())
 
 
-def run(case: str, backend: str, noise_seed: int | None = None) -> Errors:
-    """The errors of one case, with pixels moved at random where a seed is given."""
-    sequence, features, labels = recorded(case)
-    rng, score, start = np.random.default_rng(noise_seed), score_for(sequence), time.process_time()
-    system = slam.StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind))
-    results = []
-    for k, seen in enumerate(features):
-        if noise_seed is not None:
-            shift = _PIXEL_NOISE * rng.standard_normal(seen.uv_left.shape)
-            seen = replace(seen, uv_left=seen.uv_left + shift, uv_right=seen.uv_right + shift)
-        results.append(system.process_features(seen))
-        if score is not None and labels is not None:
-            score.add(k, results[-1], labels[k])
-    path = path_of(results)
-    camera = absolute_errors(*associate(path, sequence.ground_truth)).rmse
-    bodies = [] if score is None else list(score.summary()["bodies"].values())
-    moves = [b["ME"]["translation RMSE [m]"] for b in bodies if b.get("ME")]
-    covered = float(np.mean([b["coverage"] or 0.0 for b in bodies])) if bodies else 0.0
-    blob, took = path.poses.tobytes() + repr(bodies).encode(), time.process_time() - start
-    return Errors(camera, float(np.mean(moves)) if moves else None, covered, blob, took)
-
-
-def name_of(parameter: Parameter) -> str:
-    """The key of a constant in the table."""
-    return f"{parameter.module}:{parameter.name}"
-
-
-def measured(parameter: Parameter) -> bool:
-    """Whether a changed value reaches the code that uses it: it is read inside functions alone, none compiled."""
-    if parameter.file.startswith("frontends/"):
-        return False
-    tree = ast.parse((ROOT / parameter.file).read_text(encoding="utf-8"))
-    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-    compiled = ("kernel", "helper")
-    plain = [f for f in functions if not any(ast.unparse(d).endswith(compiled) for d in f.decorator_list)]
-    held = {id(node) for f in plain for statement in f.body for node in ast.walk(statement)}
-    reads = [n for n in ast.walk(tree) if isinstance(n, ast.Name) and n.id == parameter.name]
-    return all(id(node) in held for node in reads if isinstance(node.ctx, ast.Load))
-
-
-def importers(parameter: Parameter) -> list[str]:
-    """Modules that import the constant by its name."""
-    found = []
-    for file in (f for room in ("slam", "backends") for f in sorted((ROOT / room).rglob("*.py"))):
-        nodes = (n for n in ast.walk(ast.parse(file.read_text(encoding="utf-8"))) if isinstance(n, ast.ImportFrom))
-        if any(n.module == parameter.module and parameter.name in [a.name for a in n.names] for n in nodes):
-            found.append(file.relative_to(ROOT).as_posix().removesuffix(".py").replace("/", "."))
+def errors(folder: Path, seed: int, cases: list[str]) -> Errors:
+    """The errors of this program, with pixels moved at random where the seed is not 0."""
+    found = {}
+    for case, backend in ((name, backend) for name in cases for backend in CASES[name][2]):
+        sequence, features, labels = recorded(case, folder)
+        rng, score = np.random.default_rng(seed), score_for(sequence)
+        system = slam.StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind))
+        results = []
+        for k, seen in enumerate(features):
+            if seed:
+                shift = _PIXEL_NOISE * rng.standard_normal(seen.uv_left.shape)
+                seen = replace(seen, uv_left=seen.uv_left + shift, uv_right=seen.uv_right + shift)
+            results.append(system.process_features(seen))
+            if score is not None and labels is not None:
+                score.add(k, results[-1], labels[k])
+        path = path_of(results)
+        bodies = [] if score is None else list(score.summary()["bodies"].values())
+        moves = [b["ME"]["translation RMSE [m]"] for b in bodies if b.get("ME")]
+        reported = repr(bodies) + repr([(o.id, o.estimate.T_world_object.tolist()) for r in results for o in r.objects])
+        found[f"{case}, {backend}"] = {
+            "camera": absolute_errors(*associate(path, sequence.ground_truth)).rmse,
+            "bodies": float(np.mean(moves)) if moves else None,
+            "covered": float(np.mean([b["coverage"] or 0.0 for b in bodies])) if bodies else 0.0,
+            "bytes": hashlib.sha256(path.poses.tobytes() + reported.encode()).hexdigest(),
+        }
     return found
 
 
-@contextmanager
-def changed(parameter: Parameter, factor: float) -> Iterator[None]:
-    """The constant times a factor, wherever it is known by its name."""
-    knowing = [importlib.import_module(name) for name in (parameter.module, *importers(parameter))]
-    before = getattr(knowing[0], parameter.name)
-    for module in knowing:
-        setattr(module, parameter.name, times(before, factor))
+def measure(tree: Path, folder: Path, seed: int, cases: list[str], patience: float | None = None) -> Errors | None:
+    """What `errors` finds in a copy of the program; None where it fails or takes longer than so many seconds."""
+    call = [sys.executable, tree / "experiments" / "sensitivity.py", "--errors", folder, str(seed), *cases]
     try:
-        yield
-    finally:
-        for module in knowing:
-            setattr(module, parameter.name, before)
+        done = subprocess.run(call, capture_output=True, text=True, timeout=patience)
+    except subprocess.TimeoutExpired:
+        return None
+    return json.loads(done.stdout.splitlines()[-1]) if done.returncode == 0 else None
 
 
 def times(value: Any, factor: float) -> Any:
@@ -146,44 +121,28 @@ def times(value: Any, factor: float) -> Any:
     return max(1, round(value * factor)) if isinstance(value, int) else value * factor
 
 
-@contextmanager
-def limited(seconds: float) -> Iterator[None]:
-    """Raises TimeoutError after so much CPU time [s]."""
-
-    def give_up(*_: Any) -> None:
-        raise TimeoutError
-
-    before = signal.signal(signal.SIGVTALRM, give_up)
-    signal.setitimer(signal.ITIMER_VIRTUAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
-        signal.signal(signal.SIGVTALRM, before)
+def change(tree: Path, parameter: Parameter, factor: float) -> None:
+    """Multiply a constant in a copy of the program."""
+    file = tree / parameter.file
+    lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+    line, start, stop = parameter.place
+    lines[line] = f"{lines[line][:start]}{times(parameter.value, factor)!r}{lines[line][stop:]}"
+    file.write_text("".join(lines), encoding="utf-8")
 
 
-Defaults = dict[tuple[str, str], Errors]  # of the default values, by case and back end
-
-
-def ratios(parameter: Parameter, factor: float, defaults: Defaults) -> dict[str, float | str]:
-    """Errors of the camera and of the bodies over the default's: means over the cases, the worse back end.
+def ratios(new: Errors | None, defaults: Errors) -> dict[str, float | str]:
+    """Errors of the camera and of the bodies over the default's: means over the cases, the worst back end.
 
     "same" where all runs give the same bytes, "fails" where one does not end well.
     """
-    new: Defaults = {}
-    try:
-        with changed(parameter, factor):
-            for key, default in defaults.items():
-                with limited(_PATIENCE * max(default.seconds, 1.0)):
-                    new[key] = run(*key)
-    except _FAILURES:
+    if new is None:
         return _FAILED
-    if all(new[key].bytes == default.bytes for key, default in defaults.items()):
+    if all(new[key]["bytes"] == default["bytes"] for key, default in defaults.items()):
         return {"camera": "same", "bodies": "same"}
-    known = {key: default for key, default in defaults.items() if default.bodies is not None}
-    lost = any(new[k].bodies is None or new[k].covered < _UNCOVERED * d.covered for k, d in known.items())
-    camera = [(new[k].camera / d.camera, k[1]) for k, d in defaults.items()]
-    bodies = [((new[k].bodies or 0.0) / (d.bodies or 1.0), k[1]) for k, d in known.items()]
+    known = {key: default for key, default in defaults.items() if default["bodies"] is not None}
+    lost = any(new[k]["bodies"] is None or new[k]["covered"] < _UNCOVERED * d["covered"] for k, d in known.items())
+    camera = [(new[k]["camera"] / d["camera"], k) for k, d in defaults.items()]
+    bodies = [((new[k]["bodies"] or 0.0) / d["bodies"], k) for k, d in known.items()]
     return {"camera": _worst(camera), "bodies": "fails" if lost else _worst(bodies)}
 
 
@@ -191,19 +150,23 @@ def _worst(values: list[tuple[float, str]]) -> float | str:
     """The largest geometric mean among the back ends'; "fails" where a run has lost its way."""
     if not values or not np.isfinite([v for v, _ in values]).all() or max(v for v, _ in values) > _LOST:
         return "fails"
-    logs = [np.mean([np.log(v) for v, backend in values if backend == name]) for name in BACKENDS]
-    return round(float(np.exp(max(logs))), 4)
+    of = {key.split(", ")[1] for _, key in values}
+    return round(max(_mean([v for v, key in values if key.endswith(name)]) for name in of), 4)
 
 
-def scatter(defaults: Defaults, seeds: int) -> dict[str, float]:
+def _mean(values: list[float]) -> float:
+    """The geometric mean."""
+    return float(np.exp(np.mean(np.log(values))))
+
+
+def scatter(perturbed: list[Errors], defaults: Errors) -> dict[str, float]:
     """The largest factor by which the errors of perturbed runs of one back end differ from the default's."""
     worst = {"camera": 1.0, "bodies": 1.0}
-    for seed, backend in ((seed, backend) for seed in range(seeds) for backend in BACKENDS):
-        pairs = [(run(*key, seed), default) for key, default in defaults.items() if key[1] == backend]
+    for new, name in ((new, key.split(", ")[1]) for new in perturbed for key in defaults):
         for what in worst:
-            both = [(getattr(n, what), getattr(d, what)) for n, d in pairs if getattr(n, what) and getattr(d, what)]
-            logs = [np.log(new / default) for new, default in both]
-            worst[what] = max(worst[what], float(np.exp(abs(np.mean(logs)))) if logs else 1.0)
+            both = [(new[key][what], d[what]) for key, d in defaults.items() if key.endswith(name)]
+            mean = _mean([a / b for a, b in both if a and b] or [1.0])
+            worst[what] = max(worst[what], mean, 1.0 / mean)
     return worst
 
 
@@ -213,22 +176,43 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="one constant, one world")
     parser.add_argument("--only", default="", help="constants whose module:NAME contains this")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "sensitivity.json")
+    parser.add_argument("--errors", nargs="+", metavar="ARG", help="features, seed, cases: print errors alone")
     given = parser.parse_args()
+    if given.errors:
+        folder, seed, *cases = given.errors
+        print(json.dumps(errors(Path(folder), int(seed), cases)))
+        return 0
     file = given.out / "sensitivity.json" if given.out.is_dir() else given.out
     table = json.loads(file.read_text()) if file.exists() else {"ratios": {}}
-    present = {name_of(p): p for p in find()}
-    found = table["ratios"] = {name: each for name, each in table["ratios"].items() if name in present}
-    wanted = {name: p for name, p in present.items() if given.only in name and name not in found and measured(p)}
-    cases = list(CASES)[: 1 if given.quick else None]
-    defaults = {(case, backend): (run(case, backend), run(case, backend))[1] for case in cases for backend in BACKENDS}
-    table["cases"] = cases
-    if "scatter" not in table:
-        table["scatter"] = scatter(defaults, 1 if given.quick else _PERTURBATIONS)
-    for name, parameter in list(wanted.items())[: 1 if given.quick else None]:
-        for outcome in ([_FAILED] * len(FACTORS), None):  # the first stays where the process ends here
-            found[name] = outcome or [ratios(parameter, factor, defaults) for factor in FACTORS]
+    present = {p.key: p for p in find()}
+    found = table["ratios"] = {key: each for key, each in table["ratios"].items() if key in present}
+    wanted = [p for key, p in present.items() if given.only in key and key not in found]
+    cases = table["cases"] = list(CASES)[: 1 if given.quick else None]
+    with tempfile.TemporaryDirectory() as name:
+        tree, changed, features, fresh = (Path(name) / part for part in ("tree", "changed", "features", "fresh"))
+        features.mkdir()
+        shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns(".*", "docs", "tests", "build", "results"))
+        measure(tree, features, 0, cases)  # compiles, and extracts features
+        start = time.monotonic()
+        defaults = measure(tree, features, 0, cases)
+        assert defaults is not None, "the program fails as it is"
+        patience = _PATIENCE * (time.monotonic() - start)
+        if "scatter" not in table:
+            seeds = range(1, 2 if given.quick else _PERTURBATIONS + 1)
+            runs = [measure(tree, features, seed, cases) for seed in seeds]
+            table["scatter"] = scatter([run for run in runs if run], defaults)
+        for parameter in sorted(wanted, key=lambda p: p.kind != "choice")[: 1 if given.quick else None]:
+            sides = found[parameter.key] = []
+            for factor in FACTORS:
+                shutil.copytree(tree, changed)
+                change(changed, parameter, factor)
+                fresh.mkdir()
+                own = fresh if parameter.file.startswith("frontends/") else features
+                sides.append(ratios(measure(changed, own, 0, cases, patience), defaults))
+                shutil.rmtree(changed)
+                shutil.rmtree(fresh)
             file.write_text(json.dumps(table, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-        print(name, found[name], flush=True)
+            print(parameter.key, sides, flush=True)
     print(f"{len(found)} constants; scatter {table.get('scatter')}")
     return 0
 

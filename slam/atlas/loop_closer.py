@@ -24,11 +24,7 @@ from slam.tracks.mapper import depth_is_known
 from slam.tracks.step import Step
 from slam.tracks.table import LandmarkTable
 
-_NEARBY = 4  # cost: keyframes compared because they are near the path, besides those that look alike
-_VERIFIED = 3  # cost: keyframes whose geometry is checked, of those that are compared in detail
 _MINIMAL = 6  # least number of features of a keyframe: enough for a pose with a covariance
-_LARGEST = 6e4  # guard: largest number in a keyframe's descriptors, which are half floats
-_HYPOTHESES = 300  # cost: poses tried, so that with a quarter of the matches right one place in a hundred is missed
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +52,8 @@ class LoopCloser:
         self._enabled = enabled
         self._sigma, self._max_depth_error = models.pixel_sigma, max_depth_error
         lax = 2 * association.consistency_sigmas  # a keyframe's points have the depth of one frame alone
-        association = replace(association, wide_hypotheses=_HYPOTHESES, consistency_sigmas=lax)
+        # with a quarter of the matches right, 300 poses miss one place in a hundred
+        association = replace(association, wide_hypotheses=300, consistency_sigmas=lax)
         self._localizer = Localizer(self._rig, association, models)
 
     def update(self, atlas: Atlas, step: Step) -> Atlas:
@@ -137,7 +134,8 @@ class LoopCloser:
             added = step_covariance(last, T, P)
         elif len(gaps) == 1 and gaps[0].covariance is not None:
             added = gaps[0].covariance + P
-        descriptors = narrowed(np.clip(features.descriptors[rows], -_LARGEST, _LARGEST), np.float16)
+        largest = float(np.finfo(np.float16).max)
+        descriptors = narrowed(np.clip(features.descriptors[rows], -largest, largest), np.float16)
         return Keyframe(
             step.index, features.stamp, T, P, added, step.common.jacobian,
             0.0 if last is None else last.travelled + went, float(np.median(points[:, 2])),
@@ -160,7 +158,7 @@ class LoopCloser:
         likely = self._most_alike(atlas, new.descriptors.astype(np.float32), possible)
         looks_at = poses[:, :3, 3] + new.depth * poses[:, :3, 2] - here[:3, 3] - new.depth * here[:3, 2]
         nearest = np.argsort(np.where(possible, far + np.linalg.norm(looks_at, axis=1), np.inf), kind="stable")
-        likely = np.unique(np.concatenate([likely, nearest[: min(_NEARBY, int(possible.sum()))]]))
+        likely = np.unique(np.concatenate([likely, nearest[: min(4, int(possible.sum()))]]))
         return self._ranked(atlas, self._not_measured(atlas, likely, known), step.features)
 
     def _anywhere(self, atlas: Atlas, new: Keyframe, known: IdArray, features: StereoFeatures) -> NDArray[np.intp]:
@@ -201,7 +199,7 @@ class LoopCloser:
         limits = config.wide_d_match, config.wide_ratio
         found = [match_everywhere(k.descriptors.astype(np.float32), k.laplacian, features, *limits) for k in seen]
         number = np.array([len(matches) for matches in found], int)
-        order = np.argsort(-number, kind="stable")[:_VERIFIED]
+        order = np.argsort(-number, kind="stable")[:3]  # the geometry of so many is checked
         return likely[order[number[order] >= max(enough, AtlasConfig.inliers)]]
 
     def _verified(

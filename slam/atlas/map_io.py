@@ -33,15 +33,13 @@ from slam.version import __version__
 
 _MAGIC = "surf-stereo-slam map "
 _VERSION = 7  # fixed: of the file format
-_DATE = (1980, 1, 1, 0, 0, 0)  # fixed: NumPy's for all members, so that the same map gives the same bytes
 
 _LARGEST = 2**31  # bytes of a file
 _MOST_DIMENSIONS, _LONGEST = 4096, 1e6  # guard: of descriptors
 _GREATEST = 1e12  # guard: entry of a covariance [rad², m²], and time [s]
 _RIG = ("width", "height", "focal", "baseline")  # by which a map tells its rig from others
 _REFINED = 0.03  # guard: calibrations of one rig differ by less: it is ten deviations of a focal length, by the prior
-_TURNED = 1e-6  # guard: largest deviation from a rotation matrix
-_FAR, _HALF = FARTHEST_POSITION, 65504.0  # guard: [m]; the largest half float
+_FAR, _HALF = FARTHEST_POSITION, float(np.finfo(np.float16).max)
 
 
 #: Arrays of the landmarks.
@@ -83,7 +81,7 @@ def _require(arrays: Mapping[str, Any], kinds: Mapping[str, Kind], source: str) 
         if kind.what == "covariance" and any(_no_covariance(P) for P in arrays[name]):
             raise SlamError(f"{source}: {name} holds what is no covariance")
         R = arrays[name][:, :3, :3] if kind.what == "pose" else ()
-        if any(np.abs(nearest_rotation(rotation) - rotation).max() > _TURNED for rotation in R):
+        if any(np.abs(nearest_rotation(rotation) - rotation).max() > 1e-6 for rotation in R):
             raise SlamError(f"{source}: {name} holds what is no pose")
 
 
@@ -242,7 +240,8 @@ def encode(saved: SavedMap) -> bytes:
     np.savez(archive, **arrays)
     with zipfile.ZipFile(archive, "a") as file:
         content = json.dumps(header, indent=2, sort_keys=True, ensure_ascii=False) + "\n"
-        file.writestr(zipfile.ZipInfo("header.json", _DATE), content)
+        # its date is that which NumPy gives all members, so that the same map gives the same bytes
+        file.writestr(zipfile.ZipInfo("header.json"), content)
     body = archive.getvalue()
     return f"{_MAGIC}{_VERSION}\n{hashlib.sha256(body).hexdigest()}\n".encode() + body
 

@@ -8,17 +8,17 @@ not be recognised. For the same reason the vectors' mean is subtracted before th
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2, vq
 
 Vectors = NDArray[np.float32]
 
 _LENGTH = 1024  # cost: of a keyframe's vector: 4 kB
-_TRAINING = 50  # cost: descriptors per word from which the words are learnt
 _LEARN_AT = (8, 16, 32, 64, 128)  # cost: numbers of keyframes at which the words are learnt
-_ROUNDS = 10  # numerics: of k-means
 _NONE = 1e-12  # numerics: length below which a vector counts as zero
 
 
@@ -66,25 +66,17 @@ class PlaceIndex:
 
 def learn_words(descriptors: Vectors, number: int) -> Vectors:
     """Centres (number, D) of descriptors (F, D), by k-means on an evenly spaced subset."""
-    some = min(number * _TRAINING, len(descriptors))
+    some = min(50 * number, len(descriptors))
     descriptors = descriptors[np.linspace(0, len(descriptors) - 1, some).astype(int)]
-    words = descriptors[np.linspace(0, some - 1, number).astype(int)]
-    for _ in range(_ROUNDS):
-        members = nearest(descriptors, words)
-        count = members.sum(axis=1)[:, None]  # a word without descriptors stays where it is
-        words = np.where(count > 0, members @ descriptors / np.maximum(count, 1.0), words)
-    return words
-
-
-def nearest(descriptors: Vectors, words: Vectors) -> Vectors:
-    """One where a descriptor (F, D) is nearest to a word (W, D), else zero (W, F)."""
-    closest = (descriptors @ words.T - 0.5 * np.square(words).sum(axis=1)).argmax(axis=1)
-    return np.asarray(closest == np.arange(len(words))[:, None], np.float32)
+    first = descriptors[np.linspace(0, some - 1, number).astype(int)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a word without descriptors stays where it is
+        return np.asarray(kmeans2(descriptors, first, iter=10, minit="matrix")[0], np.float32)
 
 
 def aggregate(descriptors: Vectors, words: Vectors) -> NDArray[np.float32]:
     """VLAD vector (W · D,) of descriptors (F, D): each word's part is normalised, then the whole, to unit length."""
-    members = nearest(descriptors, words)
+    members = (vq(descriptors, words)[0] == np.arange(len(words))[:, None]).astype(np.float32)
     parts = members @ descriptors - members.sum(axis=1)[:, None] * words
     parts /= np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), _NONE)
     vector = parts.ravel()

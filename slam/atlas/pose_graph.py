@@ -32,10 +32,6 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
     from scipy.sparse.linalg import SuperLU
 
-_ROUNDS = 30  # numerics: most iterations
-_CONVERGED = 1e-3  # numerics: decrease of χ² at which iteration ends
-_HALVINGS = 8  # numerics: most halvings of a step that increases χ²
-
 
 @dataclass(frozen=True, eq=False)
 class Chain:
@@ -247,10 +243,10 @@ class _Motions:
     def optimised(self, poses: Array, common: Array) -> tuple[Array, Array, _Normal]:
         """Poses (M, 4, 4) and common errors (m,) that minimise χ², and normal equations near there."""
         cost = self.cost(poses, common)
-        for _ in range(_ROUNDS):
+        for _ in range(30):
             normal = self.normal(poses)
             step, change = normal.step(self.residuals(poses, common), common)
-            for half in 0.5 ** np.arange(_HALVINGS):
+            for half in 0.5 ** np.arange(8):  # of a step that increases χ²
                 moved = np.concatenate([poses[:1], poses[1:] @ exp(half * step)])
                 less = self.cost(moved, common + half * change)
                 if less <= cost:
@@ -258,7 +254,7 @@ class _Motions:
             else:
                 break
             poses, common, gain, cost = moved, common + half * change, cost - less, less
-            if gain < _CONVERGED and half == 1:  # a halved step may gain little anywhere
+            if gain < 1e-3 and half == 1:  # a halved step may gain little anywhere
                 break
         return poses, common, normal
 

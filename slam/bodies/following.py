@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from slam.bodies.belief import BodyBelief
 from slam.bodies.bodies import Body, of_bodies
@@ -100,9 +101,8 @@ def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
     local = frame.local[free]
     deviation = np.sqrt(2.0) * s.depth_noise(local[:, 2])
     unknown = SIGMAS * np.sqrt(np.einsum("nii->n", tracks.covariance[left])[:, None] + deviation**2)
-    expected = transform(inverse(frame.T_world_left), tracks.position[left])
-    squared = np.square(expected).sum(axis=1)[:, None] + np.square(local).sum(axis=1) - 2.0 * expected @ local.T
-    allowed = squared < np.square(c.max_speed * frame.dt + unknown)
+    away = cdist(tracks.position[left], transform(frame.T_world_left, local))
+    allowed = away < c.max_speed * frame.dt + unknown
     looks, features = (tracks.look[left], tracks.laplacian[left]), frame.features.select(free)
     found = features_of_tracks.match_everywhere(*looks, features, *_ALIKE, allowed)
     tracks.set_features(left[found.tracks], free[found.features])

@@ -18,9 +18,6 @@ from slam.runtime.compilation import Stages
 from slam.runtime.threads import OneThread, one_blas_thread
 from slam.third_party import named_failures
 
-#: Largest row difference of left and right features that is assumed of a front end that does not give its own [px].
-_ROWS = 1.5
-
 
 @dataclass(frozen=True, eq=False)
 class Extracted:
@@ -51,7 +48,7 @@ class Extractor:
     """
 
     def __init__(self, frontend: Frontend | None, rig: StereoRig, models: EstimatorModels) -> None:
-        rows = getattr(getattr(frontend, "config", None), "epipolar", _ROWS)
+        rows = getattr(getattr(frontend, "config", None), "epipolar", 1.5)  # [px]: as SURF, where it does not say
         self._rig, self.input_warnings = rig, InputWarnings(rig, models, rows)
         self._extracting = OneThread("this system's front end")
 

@@ -24,7 +24,6 @@ from slam.tracks.table import LandmarkTable, Patch
 _LARGEST = 1.5  # largest factor by which a patch may have grown or shrunk: `Patches` hold no more
 _RENEWED = np.sqrt(_LARGEST)  # factor from which it is taken again, so that another such change stays below the largest
 _PARTS = attrgetter("image", "centre", "size", "T_world_left")  # of a `Patch`
-_FORGOTTEN = 10  # frames without a measurement after which a patch is dropped
 
 
 def align(
@@ -37,7 +36,7 @@ def align(
     aligned. `positions` returns landmarks' positions (M, 3) [m] in the world by their ids (M,). Raises SlamError where
     the front end does not return pixels.
     """
-    landmarks.patches[landmarks.unseen > _FORGOTTEN] = None
+    landmarks.patches[landmarks.unseen > 10] = None  # [frames]; twice or half as many: the same paths
     at = landmarks.rows(matches.ids)
     usable = landmarks.has_patch(at)
     if matches.T_world_left is None or features.images is None or not usable.any():

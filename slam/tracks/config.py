@@ -8,7 +8,7 @@ from typing import ClassVar
 from slam.bounds import LEAST, MOST, require_not_negative
 from slam.errors import ConfigurationError
 
-_COUNT, _SHARE = (1, 10**6), (0.0, 1.0)
+_COUNT, _SHARE = (1, 10**6), (0.0, 1.0)  # fixed: least and largest values
 _ASSOCIATION = {  # least and largest values
     "wide_hypotheses": (1, 100_000), "window_sigmas": (LEAST, 1e3), "window_min": (LEAST, 1e4),
     "window_max": (LEAST, 1e4), "ratio": (LEAST, 1.0), "view_ratio": (1.0, MOST), "kidnapped_after": _COUNT,

@@ -32,7 +32,6 @@ _D_MATCH, _RATIO = 0.5, 0.7  # paper: descriptor distance; ratio of the nearest 
 _KEPT = 45  # cost: frames in which a view is kept at most
 _MISFIT = 6.6  # derived: χ²(1) at 99 %, of two views of one point
 _VIEWS = 400  # cost: views kept at most
-_CLAIM = 12.0  # a landmark claims features within this distance of its predicted pixel
 _DIFFERENCES = np.repeat([1e-2, 1e-5], [4, 6])  # numerics: steps of numerical derivatives by pixels and by the motion
 
 
@@ -118,7 +117,7 @@ def unclaimed(uv: Array, descriptors: NDArray[np.float32], features: StereoFeatu
     """Those of the features `rows` (K,) to which no landmark in view, at pixels (M, 2), is near and looks alike."""
     if not len(rows) or not len(uv):
         return np.asarray(rows)
-    at, which = np.nonzero(np.abs(uv[:, None] - features.uv_left[rows]).max(axis=2) <= _CLAIM)
+    at, which = np.nonzero(np.abs(uv[:, None] - features.uv_left[rows]).max(axis=2) <= 12.0)
     gap = np.linalg.norm(descriptors[at] - features.descriptors[rows[which]], axis=1)
     return np.delete(rows, which[gap < _D_MATCH])
 

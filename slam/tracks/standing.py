@@ -29,7 +29,6 @@ _GATE = chi_square_limit(3, 0.997)  # of the displacement of a feature that stay
 _MOVES = chi_square_limit(6, 1 - 1e-4)  # of a common motion; asked in every frame
 _MEDIAN = chi_square_limit(3, 0.5)
 _FEW = 2 * MINIMAL_POINTS  # features that tell nothing of a motion
-_BLIND = 10  # frames without enough features that stay, after which the camera may have been carried off
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +108,7 @@ class Standing:
         at_rest, variance = _at_rest(rig, places.z[at], shift, self.variance)
         if at_rest:
             return Standing(places_after, self.frames + 1, witnesses, variance, self.T_world_left)
-        if self.stands and len(rows) <= _FEW and self.blind < min(self.frames, _BLIND):
+        if self.stands and len(rows) <= _FEW and self.blind < min(self.frames, 10):  # frames: then carried off
             return changed(self, places=places_after, witnesses=witnesses, blind=self.blind + 1)
         return begun
 

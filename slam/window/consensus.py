@@ -24,7 +24,6 @@ _BATCH = 10  # cost: hypotheses tried at once
 _ENOUGH = 100  # cost: matches that fix a pose far better than is needed to tell which others agree
 _HYPOTHESES = 200  # cost: poses tried in the search for one on which the landmarks agree
 _CAMERA = np.eye(3)  # fixed: of bearings, not pixels
-_AS_NEW = 2.0  # innovation variance of a landmark as uncertain as a new one, in units of the pixel variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +69,7 @@ def landmarks_pose(measure: RectifiedMeasurement, points: Array, z: Array, T: Ar
     Measurements z (M, 3) are those of `RectifiedStereo.measure`.
     """
     sigma, probability = measure.models.pixel_sigma, measure.models.gate_probability
-    threshold = sigma * float(np.sqrt(_AS_NEW * chi_square_limit(3, probability)))
+    threshold = sigma * float(np.sqrt(2.0 * chi_square_limit(3, probability)))  # landmarks as uncertain as new ones
     measured = z + np.array([0.0, 0.0, measure.stereo.doffs])
     found = find_consensus(measure.rig, points, measured, T, threshold, _HYPOTHESES, seed)
     return found.T_world_left if found.inliers.sum() >= max(MIN_CONSENSUS, (len(z) + 1) // 2) else None

@@ -21,7 +21,6 @@ from slam.window.problem import RelativePrior, Rows, Window
 from slam.window.solver import row_distances
 from slam.window.stereo import RectifiedStereo
 
-_HUBER = 1.5  # whitened residual from which on a measurement's pull no longer grows
 _ROUNDS = 3  # numerics: of solving and gating
 _ANY = RelativePrior.of_pose(np.eye(4), np.eye(6))
 
@@ -70,7 +69,7 @@ def solve(problem: PoseProblem, start: Array) -> tuple[Array, BoolArray]:
     w = problem.window(start)
     rows = w.rows
     limits = chi_square_limits(2 + np.isfinite(problem.z[:, 2]), problem.probability)
-    w = solver.solve(w, huber=_HUBER).window
+    w = solver.solve(w, huber=1.5).window  # whitened; the pull of what is farther off grows no more
     used = row_distances(w) <= limits
     for _ in range(_ROUNDS):
         counts = np.where(used[:, None, None], rows.root, 0.0)

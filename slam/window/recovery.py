@@ -23,7 +23,6 @@ from slam.window import pose_only
 from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, by_chance
 
 _LASTING = 3  # updates in succession that contradict the path: one may be at fault itself
-_RADIAN = 1.0  # variance of a turn [rad²] beyond which next to nothing is known of it
 _ANY_TURN = np.pi**2 / 3  # variance of a turn by any angle [rad²]
 
 
@@ -68,7 +67,7 @@ def unknown_turn(P: Array) -> bool:
     """Whether the orientation of a pose with covariance P (6, 6) is uncertain by more than a radian."""
     # the norm, which is no less than an eigenvalue, takes a tenth of the time
     P = P[:3, :3]
-    return not (P * P).sum() <= _RADIAN**2 and bool(np.linalg.eigvalsh(P).max() > _RADIAN)
+    return not (P * P).sum() <= 1.0 and bool(np.linalg.eigvalsh(P).max() > 1.0)
 
 
 def _seated(problem: pose_only.PoseProblem, there: Array) -> Agreement | None:

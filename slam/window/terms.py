@@ -14,7 +14,7 @@ from slam.kernels.velocities import add_velocity_rows, velocity_change
 from slam.runtime.compilation import helper
 from slam.window.chart_kernels import chart
 
-#: What a point is to the solver: known exactly, or eliminated. Others (0, 1, ...) are its place among the prior's.
+#: fixed: what a point is to the solver, known exactly or eliminated. Others: its place among the prior's.
 KNOWN, ELIMINATED = -2, -1
 
 _BEHIND = 100.0  # numerics: whitened residual of a point that is behind its camera
