@@ -36,7 +36,7 @@ def align(
     aligned. `positions` returns landmarks' positions (M, 3) [m] in the world by their ids (M,). Raises SlamError where
     the front end does not return pixels.
     """
-    landmarks.patches[landmarks.unseen > 10] = None  # [frames]; twice or half as many: the same paths
+    landmarks.patches[landmarks.unseen > 10] = None  # [frames]
     at = landmarks.rows(matches.ids)
     usable = landmarks.has_patch(at)
     if matches.T_world_left is None or features.images is None or not usable.any():
