@@ -114,8 +114,8 @@ EXPERIMENTS = (
     ),
     Experiment(
         "knee", "recordings", "How many features and landmarks",
-        left_out=("largest", "±", "ekf", "window", "CPU extract", "CPU window", "NEES", "bodies", "measured"),
-        says="Ratios to 800 features, and to 150 (handheld 80) landmarks in view.",
+        left_out=("largest", "±", "ekf", "window", "CPU window", "bodies", "measured"),
+        says="Ratios to 600 (handheld 800) features, and to 100 (handheld 80) landmarks in view.",
     ),
     Experiment(
         "consistency", "honesty", "Do the back ends know how sure they are?", arguments=("--seeds", "30"), pictures={
