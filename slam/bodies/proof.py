@@ -31,7 +31,9 @@ from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, inverse, points_by_pose
 
 PROVEN = 24.0  #: sum of −log10 of chances that proves that a body moves that went farther than the camera
-_SLIDES = 40.0  # the same elsewhere: what slides with the camera was seen to agree by up to 1e-16 in a frame
+_SLIDES = (
+    40.0  # the same elsewhere, in two frames at least: what slides with the camera was seen to agree by up to 1e-16
+)
 _FARTHER = 2.0  # times the camera's way; from 2 to 4 nothing changes, at 1 what slides in EuRoC MH_01 is a body
 _BOTH = 0.75  # share of measurements that both cameras make: of bodies 0.93, with wrong matches 0.5
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
