@@ -22,6 +22,7 @@ from slam.tracks.table import Tracks
 
 _UNMEASURED = 1.0  # [s] for which a body is still reported after its last measurement
 UNMEASURED_SHARE = 0.05  #: most frames in which it is so, as a share of those in which it was measured
+PROOF = 4  #: by frames that are certain by both tests, each of which counts twice, or by way and turn together
 SOLID = 0.6  #: share of the points inside a body that go with it: where others stand still, a shadow or leaves move
 CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
@@ -48,7 +49,7 @@ class Body:
     moving: bool = True  # whether it moves now
     evidence: float = 0.0  # evidence that it has moved, given all that is uncertain; see `slam.bodies.proof`
     far: bool = False  # whether it was followed for farther than it is wide
-    certain: bool = False  # whether it was once enough for a proof
+    certain: int = 0  # what frames so far count for the proof that it moves, see `slam.bodies.proof`
     agreeing: int = 0  # number of members, added over frames, that went with it rather than stood still
     against: int = 0  # number of others inside its extent, added over frames, that rather stood still
     alike: int = 0  # number of frames in which it moved as an older body did, as a part of that would
@@ -61,7 +62,7 @@ class Body:
     @property
     def proven(self) -> bool:
         """Whether it has moved for certain by its tracks, and what it encloses has, for the most part."""
-        return self.certain and self.rigid
+        return self.certain >= PROOF and self.rigid
 
     @property
     def rigid(self) -> bool:

@@ -259,10 +259,10 @@ class MovingObjectDetector(ObjectDetector):
             scene = scenes[None if whole is None else whole.id]
             moved, way = finder.moved_in(whole, tracks, members, frame), Way.of(body, frame, whole)
             far = body.far or (self.setup.config.size > 0 and body.went > body.across)
-            evidence = with_frame(body.evidence, moved, scene, way, far, both)
-            body = changed(body, evidence=evidence, certain=body.certain or evidence >= way.asked, far=far)
+            evidence, counts = with_frame(body.evidence, moved, scene, way, far, both)
+            body = changed(body, evidence=evidence, certain=body.certain + counts, far=far)
             self.bodies[body.id] = body
-            if evidence == 0.0 and (body.proven or body.seen >= WINDOW):  # the window holds how it started
+            if evidence == 0.0 if body.proven else body.seen >= 2 * WINDOW:  # the first holds how it started
                 self._drop(tracks, body)
 
     def _drop(self, tracks: Tracks, body: Body) -> None:

@@ -30,13 +30,12 @@ from slam.bodies.scene_kernels import MEDIAN, PRIOR
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, inverse, points_by_pose
 
-PROVEN = 24.0  #: sum of −log10 of chances that proves that a body moves that went farther than the camera
-_SLIDES = (
-    40.0  # the same elsewhere, in two frames at least: what slides with the camera was seen to agree by up to 1e-16
-)
+PROVEN = 12.0  #: −log10 of the chance from which a frame proves that a body moves that went farther than the camera
+_SLIDES = 20.0  # the same elsewhere: what slides with the camera was seen to agree by up to 1e-16
 _FARTHER = 2.0  # times the camera's way; from 2 to 4 nothing changes, at 1 what slides in EuRoC MH_01 is a body
 _BOTH = 0.75  # share of measurements that both cameras make: of bodies 0.93, with wrong matches 0.5
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
+_MOST = 40.0  # numerics: of the evidence of a frame
 _WEAK = 1e-9  # numerics: of variance [m²]
 _ENDS = 0.5 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])  # of a body, from its middle, in its sides
 
@@ -72,8 +71,8 @@ class Way:
         return cls(places, in_view, stamps[seen], by_rig, cameras[:, :3, 3])
 
     @property
-    def asked(self) -> float:
-        """The evidence from which it is certain: what slides does not go farther than the camera by far."""
+    def bar(self) -> float:
+        """−log10 of the chance from which it is certain: what slides does not go farther than the camera by far."""
         went = np.linalg.norm(np.ptp(self.places, axis=0), axis=1).max()
         return PROVEN if went > _FARTHER * np.linalg.norm(np.ptp(self.cameras, axis=0)) else _SLIDES
 
@@ -89,29 +88,32 @@ class Way:
 
 def with_frame(
     evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool, both: float
-) -> float:  # fmt: skip
-    """The evidence that a body moves still, after one more frame.
+) -> tuple[float, int]:  # fmt: skip
+    """The evidence that a body moves still, after one more frame, and what this frame counts for its `PROOF`.
 
-    It is a cumulative sum of −log10 of the chance that the weaker test gives; it fades while a body rests. For a body
-    that was followed `far`, for farther than it is wide, its way alone counts, if it goes one in the camera's axes as
-    well. Both cameras made the share `both` of the members' measurements. Where too few members are seen, or this may
-    be no body, it does not grow.
+    The evidence is a cumulative sum of −log10 of the chance that the weaker test gives; it fades while a body rests.
+    For a body that was followed `far`, for farther than it is wide, its way alone counts, if it goes one in the
+    camera's axes as well. Both cameras made the share `both` of the members' measurements.
     """
-    says = _by_frames(way.places if far else way.beside_camera(), way.times)
+    says, turns, bar = _by_frames(way.places if far else way.beside_camera(), way.times), 0.0, way.bar
+    if both < _BOTH or (far and _by_frames(way.in_view, way.times) < PROVEN):
+        bar = np.inf
+    if len(moved.d) < MIN_POINTS:
+        return evidence, 2 * (far and says >= bar)
     if not far:
-        says = min(says, _by_members(moved, scene, way.by_rig)) if len(moved.d) >= MIN_POINTS else _ALLOWANCE
-    if both < _BOTH or (far and _by_frames(way.in_view, way.times) < 0.5 * PROVEN):
-        says = min(says, _ALLOWANCE)
-    return max(0.0, evidence + says - _ALLOWANCE)
+        by_members, turns = _by_members(moved, scene, way.by_rig)
+        says = min(says, by_members)
+    counts = 0 if says < max(0.5 * PROVEN, bar - turns) else 2 if says >= PROVEN else 1
+    return max(0.0, evidence + says - _ALLOWANCE), counts
 
 
 def _evidence(chance: float) -> float:
-    """−log10 of a chance, but no more than a proof takes: one frame is none."""
-    return -float(np.log10(max(chance, 10.0**-PROVEN)))
+    """−log10 of a chance."""
+    return -float(np.log10(max(chance, 10.0**-_MOST)))
 
 
-def _by_members(moved: Displacements, scene: Scene, by_rig: Array) -> float:
-    """−log10 of the chance of so large a common motion of the members, if they stand still."""
+def _by_members(moved: Displacements, scene: Scene, by_rig: Array) -> tuple[float, float]:
+    """−log10 of the chance of so large a common motion of the members, and of such a turn, if they stand still."""
     J, dof = -moved.lag[:, None, None] * points_by_pose(moved.points), 3 * len(moved.d)
     JW = np.swapaxes(J, 1, 2) @ moved.W
     P = np.linalg.inv((JW @ J).sum(axis=0) + np.diag(PRIOR))
@@ -121,7 +123,9 @@ def _by_members(moved: Displacements, scene: Scene, by_rig: Array) -> float:
     scatter = median(np.einsum("ni,nij,nj->n", rest, moved.W, rest)) / MEDIAN * dof / (dof - 6)
     covariance = max(scatter, 1.0) * P + scene.covariance
     covariance[3:, 3:] += np.outer(by_rig, by_rig)
-    return _evidence(float(chdtrc(6, motion @ np.linalg.solve(covariance, motion))))
+    turn = motion[:3] @ np.linalg.solve(covariance[:3, :3], motion[:3])
+    motion_test = motion @ np.linalg.solve(covariance, motion)
+    return _evidence(float(chdtrc(6, motion_test))), _evidence(float(chdtrc(3, turn)))
 
 
 def _by_frames(places: Array, times: Array) -> float:

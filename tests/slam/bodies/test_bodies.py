@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slam.bodies.belief import EVEN, when_measured, when_missed
-from slam.bodies.bodies import hidden, new_body, reported, with_evidence
+from slam.bodies.bodies import PROOF, hidden, new_body, reported, with_evidence
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.detector import MovingObjectDetector
 from slam.data import Estimate, StereoFeatures
@@ -74,7 +74,7 @@ def test_a_body_out_of_view_is_reported_for_a_short_while_only(measured, missed,
     body, tracks, _, _ = scene(4, np.zeros(6), np.random.default_rng(0))
     belief = replace(body.belief, estimate=replace(body.belief.estimate, measured=measured, stamp=10.0))
     body = replace(
-        body, belief=belief, certain=True, seen=100, missed=missed, seen_at=10.0 - since, existence=existence
+        body, belief=belief, certain=PROOF, seen=100, missed=missed, seen_at=10.0 - since, existence=existence
     )
     assert [(thing.measured_at, thing.existence) for thing in reported({1: body}, tracks, 1)] == (
         [(10.0 - since, existence)] if told else []

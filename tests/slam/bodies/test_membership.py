@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 
 from slam.bodies import membership
-from slam.bodies.bodies import Body, continued, new_body, with_evidence, with_extent
-from slam.bodies.config import CLEAR, RUN, ObjectsConfig
-from slam.bodies.detector import MovingObjectDetector
+from slam.bodies.bodies import PROOF, Body, continued, new_body, with_evidence, with_extent
+from slam.bodies.config import CLEAR, ObjectsConfig
 from slam.bodies.fits import fit_positions
 from slam.bodies.membership import merge
 from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, transform
-from slam.models import models_for
 from slam.tracks.table import Tracks
 
 WINDOW = 12
@@ -70,7 +68,7 @@ def seen_from(poses: Array, local: Array, seed: int) -> Array:
 def body_along(poses: Array, members: Array, tracks: Tracks, id: int = 1) -> Body:
     """A settled body with these poses whose members are these rows."""
     body = new_body(id, poses[SLOT, :3, 3], np.zeros(6), TIMES, 0.0, 0.0)
-    body = replace(body, T=poses[SLOT], history=poses, seen=50, certain=True)
+    body = replace(body, T=poses[SLOT], history=poses, seen=50, certain=PROOF)
     membership.add_members(body, tracks, members, sure=True)
     return with_extent(body, tracks.local[members])
 
@@ -108,9 +106,9 @@ def test_a_part_that_turns_otherwise_leaves_and_comes_back_only_on_proof() -> No
 
 @pytest.mark.parametrize(
     ("still", "behind", "certain", "solid"),
-    [(0, 0, False, True), (6, 0, False, True), (12, 0, False, False), (12, 1, False, False), (12, 1, True, True)],
+    [(0, 0, 0, True), (6, 0, 0, True), (12, 0, 0, False), (12, 1, 0, False), (12, 1, PROOF, True)],
 )
-def test_what_encloses_points_that_stand_still_is_no_body(still: int, behind: int, certain: bool, solid: bool) -> None:
+def test_what_encloses_points_that_stand_still_is_no_body(still: int, behind: int, certain: int, solid: bool) -> None:
     """The shadow of somebody who walks: the ground shows within it; a body not proven yet shows nothing behind it."""
     poses = path(MOVING)
     ground = 0.6 * corners(12, 4) + poses[SLOT, :3, 3] + behind * AHEAD
@@ -119,20 +117,8 @@ def test_what_encloses_points_that_stand_still_is_no_body(still: int, behind: in
     body = replace(body_along(poses, np.arange(16), tracks), certain=certain)
     gains, against = membership.update_members({1: body}, FRAME, tracks)[1]
     assert against == (0 if behind and certain else still)
-    after = with_evidence(replace(body, certain=True), 0.0, int((gains > CLEAR).sum()), against)
+    after = with_evidence(replace(body, certain=PROOF), 0.0, int((gains > CLEAR).sum()), against)
     assert after.proven == solid
-
-
-@pytest.mark.parametrize(("still", "seen", "kept"), [(6, 99, True), (12, RUN, True), (12, RUN + 1, False)])
-def test_a_candidate_that_encloses_what_stands_still_is_dropped(still: int, seen: int, kept: bool) -> None:
-    poses = path(MOVING)
-    ground = 0.6 * corners(12, 4) + poses[SLOT, :3, 3]
-    ground[still:, 0] += 0.5
-    tracks = table(np.concatenate([seen_from(poses, corners(16, 1), 2), seen_from(STILL, ground, 3)]))
-    detector = MovingObjectDetector(RIG, ObjectsConfig(), models_for("handheld"))
-    detector.bodies = {1: replace(body_along(poses, np.arange(16), tracks), certain=False, seen=seen)}
-    detector._change_members(tracks, FRAME)
-    assert bool(detector.bodies) == kept
 
 
 @pytest.mark.parametrize(
