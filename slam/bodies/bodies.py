@@ -62,12 +62,7 @@ class Body:
     @property
     def proven(self) -> bool:
         """Whether it has moved for certain by its tracks, and what it encloses has, for the most part."""
-        return self.certain >= PROOF and self.rigid
-
-    @property
-    def rigid(self) -> bool:
-        """Whether what it encloses goes with it, for the most part, rather than stands still."""
-        return self.agreeing >= SOLID * (self.agreeing + self.against)
+        return self.certain >= PROOF and self.agreeing >= SOLID * (self.agreeing + self.against)
 
     @property
     def off(self) -> float:

@@ -176,7 +176,7 @@ class MovingObjectDetector(ObjectDetector):
         """Predict all bodies; forget those not seen for long, and those gone before they were proven."""
         now, dt = frame.features.stamp, frame.dt
         for body in list(self.bodies.values()):
-            if now - body.seen_at > _FORGOTTEN or (body.missed > RUN and not body.proven):
+            if now - body.seen_at > _FORGOTTEN or (body.gone and not body.proven):
                 del self.bodies[body.id]
                 tracks.give_up(np.flatnonzero(tracks.body == body.id))
             else:
@@ -223,7 +223,7 @@ class MovingObjectDetector(ObjectDetector):
             gains, against = said.get(id, (np.zeros(0), 0))
             typical = median(gains) if len(gains) else 0.0
             body = self.bodies[id] = with_evidence(body, typical, int((gains > CLEAR).sum()), against)
-            if id in said and not body.proven and (typical <= 0 or (body.seen > RUN and not body.rigid)):
+            if id in said and typical <= 0 and not body.proven:
                 self._drop(tracks, body)
             elif id in said:
                 mine = np.flatnonzero((tracks.body == id) & tracks.sure)
