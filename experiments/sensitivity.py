@@ -13,12 +13,13 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import pickle
+import resource
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,7 +54,7 @@ CASES = {
 _PERTURBATIONS = 6  # runs of the default with noise, for the scatter
 _PIXEL_NOISE = 0.05  # [px]
 _LOST = 20.0  # times the error of the default: the run has lost its way
-_PATIENCE = 10.0  # times the default's time, after which a run counts as failed
+_PATIENCE = 10  # times the processor time of the default, after which a run counts as failed
 _UNCOVERED = 0.5  # share of the default's frames with a body below which bodies count as lost
 _FAILED = {"camera": "fails", "bodies": "fails"}
 
@@ -104,14 +105,21 @@ def errors(folder: Path, seed: int, cases: list[str]) -> Errors:
     return found
 
 
-def measure(tree: Path, folder: Path, seed: int, cases: list[str], patience: float | None = None) -> Errors | None:
-    """What `errors` finds in a copy of the program; None where it fails or takes longer than so many seconds."""
+def measure(tree: Path, folder: Path, seed: int, cases: list[str], patience: int | None = None) -> Errors | None:
+    """What `errors` finds in a copy of the program; None where it fails or needs more seconds of processor time."""
     call = [sys.executable, tree / "experiments" / "sensitivity.py", "--errors", folder, str(seed), *cases]
-    try:
-        done = subprocess.run(call, capture_output=True, text=True, timeout=patience)
-    except subprocess.TimeoutExpired:
+    limit = None if patience is None else lambda: resource.setrlimit(resource.RLIMIT_CPU, (patience, patience))
+    done = subprocess.run(call, capture_output=True, text=True, preexec_fn=limit)
+    if done.returncode != 0:
+        print("failed:", (done.stderr.splitlines() or [done.returncode])[-1], file=sys.stderr)
         return None
-    return json.loads(done.stdout.splitlines()[-1]) if done.returncode == 0 else None
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def processor_time() -> float:
+    """Seconds of processor time that the processes which `measure` started have needed so far."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def times(value: Any, factor: float) -> Any:
@@ -193,10 +201,10 @@ def main() -> int:
         features.mkdir()
         shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns(".*", "docs", "tests", "build", "results"))
         measure(tree, features, 0, cases)  # compiles, and extracts features
-        start = time.monotonic()
+        start = processor_time()
         defaults = measure(tree, features, 0, cases)
         assert defaults is not None, "the program fails as it is"
-        patience = _PATIENCE * (time.monotonic() - start)
+        patience = math.ceil(_PATIENCE * (processor_time() - start))
         if "scatter" not in table:
             seeds = range(1, 2 if given.quick else _PERTURBATIONS + 1)
             runs = [measure(tree, features, seed, cases) for seed in seeds]
