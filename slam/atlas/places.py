@@ -71,7 +71,7 @@ def learn_words(descriptors: Vectors, number: int) -> Vectors:
     first = descriptors[np.linspace(0, some - 1, number).astype(int)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a word without descriptors stays where it is
-        return np.asarray(kmeans2(descriptors, first, iter=10, minit="matrix")[0], np.float32)
+        return np.asarray(kmeans2(descriptors, first, minit="matrix")[0], np.float32)
 
 
 def aggregate(descriptors: Vectors, words: Vectors) -> NDArray[np.float32]:

@@ -243,7 +243,9 @@ class _Motions:
     def optimised(self, poses: Array, common: Array) -> tuple[Array, Array, _Normal]:
         """Poses (M, 4, 4) and common errors (m,) that minimise χ², and normal equations near there."""
         cost = self.cost(poses, common)
-        for _ in range(30):
+        for _ in range(
+            30
+        ):  # of most graphs one to nine steps; a bound for those whose steps are halved again and again
             normal = self.normal(poses)
             step, change = normal.step(self.residuals(poses, common), common)
             for half in 0.5 ** np.arange(8):  # of a step that increases χ²
@@ -254,7 +256,8 @@ class _Motions:
             else:
                 break
             poses, common, gain, cost = moved, common + half * change, cost - less, less
-            if gain < 1e-3 and half == 1:  # a halved step may gain little anywhere
+            # Of χ², in which a standard deviation counts 1; a halved step may gain little anywhere.
+            if gain < 1e-3 and half == 1:
                 break
         return poses, common, normal
 
