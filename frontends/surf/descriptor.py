@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from slam.runtime.compilation import kernel, vector_helper
 
-#: Boxes somewhat wider than cells match better; turned cells gain more by it.
-TURNED_BOX, UPRIGHT_BOX = 1.6, 1.3
+#: How much wider boxes are than cells, in cells: such match better; turned cells gain more by it.
+TURNED_EXCESS, UPRIGHT_EXCESS = 0.6, 0.3
 
 _SIGMA = 3.3  # paper: of the Gaussian weight, in cells
 _SUB = 5  # paper: wavelets along a sub-area's side
@@ -96,11 +96,11 @@ def _sum_areas(space, weights, descriptors, row):
 
 
 @kernel
-def describe(integral, uv, size, angle, box, weights):
+def describe(integral, uv, size, angle, excess, weights):
     """Descriptors (N, 16 or 64) float32 of features with pixels (N, 2), sizes (N,) [px], angles (N,) [rad], y down.
 
-    `integral` is of `integral_image`, `box` the side of the boxes that are averaged, in cells (`TURNED_BOX` or
-    `UPRIGHT_BOX`), `weights` are `gaussian_weights`.
+    `integral` is of `integral_image`, `excess` how much wider than cells the boxes are that are averaged, in cells
+    (`TURNED_EXCESS` or `UPRIGHT_EXCESS`), `weights` are `gaussian_weights`.
     """
     rows, lanes = weights.shape
     out = np.zeros((len(uv), 4 * (rows // _SUB) ** 2), np.float32)
@@ -111,6 +111,6 @@ def describe(integral, uv, size, angle, box, weights):
     pixels = integral.reshape(-1)
     for k in range(len(uv)):
         width = size[k] * (1.2 / 9.0)
-        _average_cells(pixels, integral.shape, uv[k, 0], uv[k, 1], width, angle[k], box * width, space)
+        _average_cells(pixels, integral.shape, uv[k, 0], uv[k, 1], width, angle[k], (1.0 + excess) * width, space)
         _sum_areas(space, weights, out, k)
     return out

@@ -14,7 +14,7 @@ _SIDE = 2 * _HALF + 1
 _FLAT = 2.0  # least standard deviation of a patch [grey levels of 8-bit images]
 _LANES = 16  # cost: columns are searched in whole vector registers, in which a row of a patch is kept too
 _CONTENDER = 0.7  # cost: a column no more alike than this share of what a rival needs has none beside it
-_NEIGHBOURS = 2  # columns about the best place that are no rivals of it
+_NEIGHBOURS = _HALF // 2  # columns about the best place that are no rivals: patches there overlap it by three quarters
 #: 1 at a patch's columns, 0 in the rest of a register. As an argument its length is not known when compiling: the loops
 #: over it would be unrolled instead of running on vector registers.
 ROW = np.float32(np.arange(_LANES) < _SIDE)

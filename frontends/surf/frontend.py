@@ -21,15 +21,14 @@ from slam.geometry.rig import StereoRig
 
 _SURPLUS = 1.35  # cost: features detected for each one needed, to have a choice when spreading them
 _CHOICE = 1.5  # cost: features localised for each one kept: some prove to be no maxima
-_THRESHOLDS = 5.0, 20000.0  # limits of the D_threshold that is adapted
+_THRESHOLDS = 5.0, 20000.0  # guard: limits of the D_threshold that is adapted
 _GRID = 8, 5  # cost: columns and rows over which features are spread: each cell has an equal share
 _CORRELATION = 0.8  # least one of the left and the right patch
 _UNIQUENESS = 0.8  # largest ratio of 1 - correlation of the best and the next best place on the epipolar line
 _TRIES = 4  # cost: detections at most in one image
 _REACH = 3.0  # largest sub-pixel correction along the row [px]
-_FINE_REACH = 1.5  # largest further correction by the narrow window, either way [px]
+_FINE_REACH = _REACH / 2  # largest further correction by the narrow window, either way [px]
 _COARSE = 0.9  # the search along the row may correlate less than the final patches, by this factor
-_OWN_BAND = 1.5  # rows [px] that the search reaches without looking into neighbouring rows
 
 
 class SurfFrontend:
@@ -155,7 +154,7 @@ class SurfFrontend:
         rectified = self.rig.rectified.rig
         shift, product = rectified.left.u0 - rectified.right.u0, rectified.left.fu * rectified.baseline
         low, high = product / c.max_depth + shift, product / c.min_depth + shift
-        band = max(int(np.rint(0.5 * (c.epipolar - _OWN_BAND))), 0)
+        band = int(c.epipolar / 2)  # rows of half resolution
         (pixels, half), (pixels_right, half_right) = left.floats, right.floats
         start = search_rows(half, half_right, uv, low, high, band, _COARSE * _CORRELATION, _UNIQUENESS, ROW)
         found = self._refine(pixels, pixels_right, uv, size, start)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from frontends.surf.config import SurfConfig
-from frontends.surf.descriptor import TURNED_BOX, UPRIGHT_BOX, describe, gaussian_weights
+from frontends.surf.descriptor import TURNED_EXCESS, UPRIGHT_EXCESS, describe, gaussian_weights
 from frontends.surf.detector import detect_octave, layer_sizes, make_filters
 from frontends.surf.images import Picture, integral_image
 from frontends.surf.keypoints import UPRIGHT_ANGLE, Keypoints
@@ -136,8 +136,8 @@ class Surf:
         """Angles, NaN where there is none, and descriptors of the features from `first` to before `last`."""
         uv, size, upright = keypoints.uv[first:last], keypoints.size[first:last], self.config.upright
         angle = np.full(last - first, UPRIGHT_ANGLE) if upright else orientations(integral, uv, size)
-        box = UPRIGHT_BOX if upright else TURNED_BOX
-        return angle, describe(integral, uv, size, np.nan_to_num(angle), box, self._weights)
+        excess = UPRIGHT_EXCESS if upright else TURNED_EXCESS
+        return angle, describe(integral, uv, size, np.nan_to_num(angle), excess, self._weights)
 
     def detect_and_describe(self, image: NDArray, mask: NDArray | None = None) -> tuple[Keypoints, NDArray[np.float32]]:
         """`detect` and `describe` in one."""

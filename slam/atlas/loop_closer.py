@@ -23,8 +23,7 @@ from slam.tracks.localizer import Localizer
 from slam.tracks.mapper import depth_is_known
 from slam.tracks.step import Step
 from slam.tracks.table import LandmarkTable
-
-_MINIMAL = 6  # least number of features of a keyframe: enough for a pose with a covariance
+from slam.window.gating import MIN_OBSERVATIONS
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +121,7 @@ class LoopCloser:
         rows = rows[depth_is_known(self._rig, features, rows, self._sigma, self._max_depth_error)]
         order = np.lexsort((-features.response[rows], landmark_of[rows] < 0))
         rows = np.sort(rows[order[: AtlasConfig.features]])
-        if len(rows) < _MINIMAL:
+        if len(rows) < MIN_OBSERVATIONS:
             return None
         points = self._rig.triangulate(features.uv_left[rows], features.uv_right[rows])
         T, P = step.estimate.T_world_left, step.estimate.covariance - step.common.covariance
@@ -175,7 +174,7 @@ class LoopCloser:
 
     def _not_measured(self, atlas: Atlas, rows: NDArray[np.intp], known: IdArray) -> NDArray[np.intp]:
         """Those keyframes whose landmarks the back end does not measure."""
-        few = [np.isin(atlas.keyframes[k].landmarks, known).sum() < _MINIMAL for k in rows.tolist()]
+        few = [np.isin(atlas.keyframes[k].landmarks, known).sum() < MIN_OBSERVATIONS for k in rows.tolist()]
         return rows[np.array(few, bool)]
 
     def _is_same_view(self, atlas: Atlas, loop: Loop, features: StereoFeatures) -> bool:

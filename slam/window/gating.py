@@ -10,9 +10,9 @@ from slam.geometry import kernels
 from slam.geometry.arrays import BoolArray
 from slam.geometry.se3 import Array
 
-MIN_OBSERVATIONS = 6  #: fewest observations whose agreement is tested
 ONE_AGREES_IN = 3  #: a prediction holds if at least one in so many observations agrees with it
 MIN_CONSENSUS = 5  #: fewest observations that agree on a pose by more than chance; three determine it
+MIN_OBSERVATIONS = MIN_CONSENSUS + 1  #: fewest observations whose agreement is tested: one may contradict the others
 INFLATION = (3.0, 10.0)  #: factors on the process noise's standard deviation tried if observations disagree
 
 
