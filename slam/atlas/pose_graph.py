@@ -256,8 +256,7 @@ class _Motions:
             else:
                 break
             poses, common, gain, cost = moved, common + half * change, cost - less, less
-            # Of χ², in which a standard deviation counts 1; a halved step may gain little anywhere.
-            if gain < 1e-3 and half == 1:
+            if gain < 1e-3 and half == 1:  # far below 1, a standard deviation's; a halved step may gain little anywhere
                 break
         return poses, common, normal
 
