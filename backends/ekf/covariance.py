@@ -18,17 +18,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.blas import dsyr2k, dsyrk
 
+from backends.ekf.kernels import mirror, reordered, transformed
 from slam.data import IndexArray
 from slam.geometry.arrays import Table, changed
 from slam.geometry.se3 import Array
-from slam.runtime.compilation import kernel
 
 CAMERA = 12  #: fixed: size of the camera's state [r, φ, v, ω]
 POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 RECENT = 4  #: cost: poses before the present one that are kept
 HEAD = CAMERA + POSE * (RECENT + 1)  #: fixed: size of camera and past poses, behind which the landmarks stand
 LEAVING = slice(HEAD - POSE, HEAD)  #: fixed: where the last of these stands, the pose that landmarks left
-_BLOCK = 32  # cost: rows and columns that are mirrored at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,13 +110,9 @@ class Covariance:
 
     def camera_moved(self, J: Array, noise: Array | float = 0.0) -> Covariance:
         """The camera's error (12,), or with that of past poses, becomes J times what it was, plus noise (12, 12)."""
-        F, P, by_rig = np.eye(HEAD), self.P.copy(), self.by_rig.copy()
-        F[: len(J), : len(J)] = J
-        P[:HEAD], by_rig[:HEAD] = F @ P[:HEAD], F @ by_rig[:HEAD]
-        own = P[:HEAD, :HEAD] @ F.T
-        own[:CAMERA, :CAMERA] += noise
-        P[:HEAD, :HEAD] = 0.5 * (own + own.T)
-        P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
+        P, by_rig = transformed(self.P, J), self.by_rig.copy()
+        P[:CAMERA, :CAMERA] += 0.5 * (noise + np.transpose(noise))
+        by_rig[: len(J)] = J @ by_rig[: len(J)]
         return changed(self, P=P, by_rig=by_rig)
 
     def advanced(self, J: Array, noise: Array, by_error: Array) -> Covariance:
@@ -205,26 +200,6 @@ class Covariance:
         moved = changed(self, by_rig=by_rig, apart=changed(self.apart, by_rig=apart))
         nothing = np.zeros((len(self.P), 0))
         return moved.corrected(nothing, 0 * by_rig, np.eye(CAMERA), shift)
-
-
-@kernel
-def mirror(P: Array, n: int) -> None:
-    """The lower triangle of the first n rows and columns of P also above its diagonal, in place."""
-    for first in range(0, n, _BLOCK):
-        for left in range(0, first + 1, _BLOCK):
-            for i in range(first, min(first + _BLOCK, n)):
-                for j in range(left, min(left + _BLOCK, i)):
-                    P[j, i] = P[i, j]
-
-
-@kernel
-def reordered(P: Array, order: IndexArray) -> Array:
-    """P (n, n) with its rows and columns in an order (k,)."""
-    out = np.empty((len(order), len(order)))
-    for i in range(len(order)):
-        for j in range(len(order)):
-            out[i, j] = P[order[i], order[j]]
-    return out
 
 
 def positive(P: Array, summands: Array, terms: int) -> Array:

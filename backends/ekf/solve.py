@@ -168,28 +168,26 @@ def _iterate(at: Linearisation, used: BoolArray) -> Correction:
     of the posterior. With it H leaves out what would measure the gauge, and the end is off that by what is of second
     order in a step.
     """
-    update, found = at.update, None
+    update = at.update
     for _ in range(update.iterations):
-        if found is not None:
-            at = update.linearised(found.camera, found.change[HEAD:])
         used = used & at.seen.any(axis=1)
         found = at.solved(used)
         if not np.isfinite(found.change).all() or np.abs((found.change - at.change)[3:6]).max() > np.pi:
             raise LinAlgError("a step is not finite, or turns the camera by more than half a turn")
-        if update.iterations == 1 or _linear(found):
+        if update.iterations == 1:
             return found
-    assert found is not None  # there is one iteration at least
+        at = update.linearised(found.camera, found.change[HEAD:])
+        if _linear(found, at):
+            return found
     return changed(found, linear=False)
 
 
-def _linear(found: Correction) -> bool:
+def _linear(found: Correction, there: Linearisation) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
-    now, update = found.at, found.at.update
-    step = (found.change - now.change)[update.numbers]
-    as_seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
-    errors = update.pixels_from(found.camera, found.change) - now.z - (now.own @ as_seen[:, :, None])[:, :, 0]
+    now, sigma = found.at, found.at.update.sigma
+    errors = there.z - now.z - now.differential(found.change - now.change)
     errors = np.where(now.seen & found.used[:, None], errors, 0.0)
-    if not np.abs(errors).max() < _LINEAR * update.sigma:
+    if not np.abs(errors).max() < _LINEAR * sigma:
         return False
     shift = found.white(errors.reshape(-1)) @ found.white_pose
     return bool((shift**2 <= _POSE_SHARE**2 * found.pose_covariance.diagonal()).all())
