@@ -68,7 +68,7 @@ FAULTS = (
     ),
     Fault(
         "no process noise", "backends/ekf/covariance.py",
-        "+= 0.5 * (noise + np.transpose(noise))", "+= 0 * (noise + np.transpose(noise))",
+        "own[:CAMERA, :CAMERA] += noise", "own[:CAMERA, :CAMERA] += 0 * noise",
     ),
     Fault(
         "landmarks start without their measurement's noise", "backends/ekf/covariance.py",

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.blas import dsyr2k, dsyrk
 
-from backends.ekf.kernels import mirror, reordered, transformed
+from backends.ekf.kernels import mirror, reordered
 from slam.data import IndexArray
 from slam.geometry.arrays import Table, changed
 from slam.geometry.se3 import Array
@@ -110,9 +110,13 @@ class Covariance:
 
     def camera_moved(self, J: Array, noise: Array | float = 0.0) -> Covariance:
         """The camera's error (12,), or with that of past poses, becomes J times what it was, plus noise (12, 12)."""
-        P, by_rig = transformed(self.P, J), self.by_rig.copy()
-        P[:CAMERA, :CAMERA] += 0.5 * (noise + np.transpose(noise))
-        by_rig[: len(J)] = J @ by_rig[: len(J)]
+        F, P, by_rig = np.eye(HEAD), self.P.copy(), self.by_rig.copy()
+        F[: len(J), : len(J)] = J
+        P[:HEAD], by_rig[:HEAD] = F @ P[:HEAD], F @ by_rig[:HEAD]
+        own = P[:HEAD, :HEAD] @ F.T
+        own[:CAMERA, :CAMERA] += noise
+        P[:HEAD, :HEAD] = 0.5 * (own + own.T)
+        P[HEAD:, :HEAD] = P[:HEAD, HEAD:].T
         return changed(self, P=P, by_rig=by_rig)
 
     def advanced(self, J: Array, noise: Array, by_error: Array) -> Covariance:
@@ -172,17 +176,17 @@ class Covariance:
         Args:
             V: ``K S Kᵀ = V Vᵀ`` (n, ·).
             by_rig: what errors of the rig change in the update (n, m), as derivatives.
-            J: the corrected camera's error is J (12, 12) times that of the camera before.
+            J: the corrected camera's error is J (12, 12) times that of the camera before; its velocities move no other.
             shift: the error of a corrected landmark is what it was plus its shift (N, 3, 6) times that of the pose.
         """
-        last, by_rig, D = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), CAMERA))
+        last, by_rig, D = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), POSE))
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
         mirror(P, CAMERA)
-        D[:CAMERA], D[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
-        # F P Fᵀ = P + D Yᵀ + Y Dᵀ, with F = 1 + [D, 0] and Y = P[:, :12] + D P_cc / 2
-        half = 0.5 * D @ P[:CAMERA, :CAMERA]
-        P = dsyr2k(1.0, D, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
-        by_rig += D @ by_rig[:CAMERA]
+        D[:CAMERA], D[HEAD:] = (J - np.eye(CAMERA))[:, :POSE], shift.reshape(-1, POSE) @ J[:POSE, :POSE]
+        # F P Fᵀ = P + D Yᵀ + Y Dᵀ, with F = 1 + [D, 0] and Y = P[:, :6] + D P_pp / 2
+        half = 0.5 * D @ P[:POSE, :POSE]
+        P = dsyr2k(1.0, D, P[:, :POSE] + half, 1.0, P.T, overwrite_c=1).T
+        by_rig += D @ by_rig[:POSE]
         P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]
         summands = self.P.diagonal() + 2 * (half * D).sum(axis=1)
         summands[last] = 0.0

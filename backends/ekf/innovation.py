@@ -15,9 +15,9 @@ import numpy as np
 from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dpotrs
 
-from backends.ekf import kernels
 from backends.ekf.camera import Camera, displacement, transport
 from backends.ekf.covariance import CAMERA, HEAD, POSE, Covariance
+from backends.ekf.kernels import H_times, reordered
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.data import BoolArray, IndexArray
 from slam.geometry.arrays import changed
@@ -86,15 +86,16 @@ class Update:
             change[:CAMERA] = np.linalg.solve(J, there.minus(self.camera))
         if moved is not None:
             change[HEAD:] = moved
-        asked = change[self.numbers[POSE:]].reshape(-1, 3)
-        c, points, D, gauge = self.coordinates.charted(marks.anchors, marks.c, asked)
-        if moved is not None:
-            change[self.numbers[POSE:]] = (c - marks.c).reshape(-1)  # a coordinate may be at its limit
+            asked = change[self.numbers[POSE:]].reshape(-1, 3)
+            marks = marks.moved(self.coordinates, slice(None), asked)
+            change[self.numbers[POSE:]] = (marks.c - self.landmarks.c).reshape(-1)  # a coordinate may be at its limit
+        R, r = there.pose[:3, :3], there.pose[:3, 3]
+        z, by_point = self.measure.stereo.project((marks.points - r) @ R)
+        seen = np.isfinite(self.z) & np.isfinite(z).all(axis=1, keepdims=True)
+        own = np.where(seen[:, :, None], by_point @ (R.T @ marks.D), 0.0)
         # an error that is transported displaces the world by the same, wherever it is written
-        lever = gauge @ displacement(self.camera if self.camera.transports else there)
-        camera = self.measure.stereo.intrinsics
-        parts = kernels.measured(camera, there.pose, points, D, lever, self.lever, self.z)
-        return Linearisation(self, there, J, change, *parts)
+        lever = marks.gauge @ displacement(self.camera if self.camera.transports else there)
+        return Linearisation(self, there, J, change, z, seen, own, lever)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,27 +116,24 @@ class Linearisation:
     z: Array  # what is predicted here (M, 3) [px], NaN behind a camera
     seen: BoolArray  # components (M, 3) that are measured, of landmarks before both cameras
     own: Array  # derivatives (M, 3, 3) of what is predicted by each landmark's coordinates, zero for others
-    by_pose: Array  # and by the error of the pose (3M, 6): ``−own lever``, see the module
-    B: Array  # (3M, 6)
+    lever: Array  # (M, 3, 6), see the module
 
     @cached_property
     def _along_the_world(self) -> tuple[Array, Array, Array | None]:
         """H by the pose's error (3M, 6), and B (3M, 6) and G (6, 6 + 3M), which is None where B is zero."""
-        if not (self.update.camera.transports and self.B.any()):
-            return self.by_pose, self.B, None
-        G = self.update.gauge_part
-        return self.by_pose - self.B if G is None else self.by_pose, self.B, G
+        update, lever, G = self.update, self.lever, None
+        B = (self.own @ (update.lever - lever)).reshape(-1, POSE)
+        if update.camera.transports and B.any():
+            G = update.gauge_part
+            if G is None:
+                lever = update.lever
+        return -(self.own @ lever).reshape(-1, POSE), B, G
 
     def H_times(self, X: Array) -> Array:
         """H (3M, ·) of a matrix X (n, ·), whose rows are of the errors of the state."""
-        by_pose, B, G = self._along_the_world
-        GX = X[:0] if G is None else G @ X[self.update.numbers]
-        return np.asarray(kernels.H_times(X, self.update.numbers[POSE::3], by_pose, self.own, B, GX))
-
-    def differential(self, step: Array) -> Array:
-        """Change (M, 3) of what is predicted by a small one (n,) of the state, along the world, too."""
-        X, at = step[:, None], self.update.numbers[POSE::3]
-        return np.asarray(kernels.H_times(X, at, self.by_pose, self.own, self.B, X[:0]).reshape(-1, 3))
+        (by_pose, B, G), numbers = self._along_the_world, self.update.numbers
+        out = H_times(X, numbers[POSE::3], by_pose, self.own)
+        return np.asarray(out if G is None else out - B @ (G @ X[numbers]))
 
     @cached_property
     def nu(self) -> Array:
@@ -151,17 +149,15 @@ class Linearisation:
     @cached_property
     def S(self) -> Array:
         """``S = H P Hᵀ + R`` (3M, 3M)."""
-        (by_pose, B, G), numbers, variance = self._along_the_world, self.update.numbers, self.update.sigma**2
-        HPG = self.HP[:, :0] if G is None else self.HP[:, numbers] @ G.T
-        return np.asarray(
-            kernels.innovation_covariance(self.HP, numbers[POSE::3], by_pose, self.own, B, HPG, variance)
-        )
+        S = self.H_times(np.ascontiguousarray(self.HP.T))
+        S[np.diag_indices(len(S))] += self.update.sigma**2
+        return S
 
     def solved(self, used: BoolArray) -> Correction:
         """The update by some landmarks (mask (M,)). Raises LinAlgError if S is not positive definite."""
         taken = np.flatnonzero(np.repeat(used, 3))
         # of the transpose, which is in the order that LAPACK wants
-        upper, info = dpotrf(kernels.reordered(self.S, taken).T, overwrite_a=1)
+        upper, info = dpotrf(reordered(self.S, taken).T, overwrite_a=1)
         if info != 0:
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
         return Correction(self, used, taken, upper_inverse(upper).T)

@@ -40,19 +40,6 @@ class Coordinates:
         local = ((points - anchors[:, :, 3])[:, None, :] @ anchors[:, :, :3])[:, 0]
         return np.concatenate([local[:, :2], np.ones((len(local), 1))], axis=1) / local[:, 2:]
 
-    def charted(self, anchors: Array, c: Array, change: Array | None = None) -> tuple[Array, Array, Array, Array]:
-        """Landmarks after a change (M, 3) of their coordinates c (M, 3); of an inverse depth a share `_LEFT` is left.
-
-        The measurements of a far point may want its inverse depth negative: then it goes away, step by step. Nor does
-        a step, which has no meaning so far from where it is linear, put it beside the camera that saw it first.
-
-        Returns:
-            Coordinates; positions (M, 3) [m]; derivatives (M, 3, 3) of the positions by the coordinates; derivatives
-            (M, 3, 6) of the coordinates by a displacement of the world, see `FilterLandmarks`.
-        """
-        change = np.zeros_like(c) if change is None else np.ascontiguousarray(change)
-        return charted(self.inverse_depth, np.ascontiguousarray(anchors), np.ascontiguousarray(c), change)  # type: ignore[no-any-return]
-
 
 #: By the name of the option.
 COORDINATES = {"inverse_depth": Coordinates(True), "euclidean": Coordinates(False)}
@@ -65,6 +52,7 @@ class FilterLandmarks(LandmarkRows):
     anchors: Array  # (N, 3, 4), constants
     c: Array  # coordinates (N, 3)
     points: Array  # positions (N, 3) [m] in the world, which follow from the two
+    D: Array  # derivatives (N, 3, 3) of the positions by the coordinates
     gauge: Array  # derivatives (N, 3, 6) of the coordinates by one of the world [shift, turn about its origin]
     sights: Array  # lines of sight (N, 3) up to which the slide is counted, in the world; NaN where that is not known
     last: IndexArray  # number of the frame that measured it last (N,)
@@ -74,9 +62,9 @@ class FilterLandmarks(LandmarkRows):
     def at(cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array, frame: int) -> FilterLandmarks:
         """New ones at positions (M, 3), seen from their anchors in a frame of that number."""
         c, sights = coordinates.of(anchors, points), points - anchors[:, :, 3]
-        gauge = coordinates.charted(anchors, c)[3]
+        _, _, D, gauge = charted(coordinates.inverse_depth, anchors, c, np.zeros_like(c))
         sights /= np.linalg.norm(sights, axis=1, keepdims=True)
-        return cls(ids, anchors, c, points, gauge, sights, np.full(len(ids), frame), np.zeros(len(ids), bool))
+        return cls(ids, anchors, c, points, D, gauge, sights, np.full(len(ids), frame), np.zeros(len(ids), bool))
 
     @classmethod
     def none(cls) -> FilterLandmarks:
@@ -84,10 +72,17 @@ class FilterLandmarks(LandmarkRows):
         return cls.at(Coordinates(False), np.zeros(0, np.int64), np.zeros((0, 3, 4)), np.zeros((0, 3)), -1)
 
     def moved(self, coordinates: Coordinates, rows: IndexArray | slice, change: Array) -> FilterLandmarks:
-        """With a change (M, 3) of the coordinates of some rows."""
-        c, points, gauge, last = self.c.copy(), self.points.copy(), self.gauge.copy(), self.last.copy()
-        c[rows], points[rows], _, gauge[rows] = coordinates.charted(self.anchors[rows], self.c[rows], change)
-        return changed(self, c=c, points=points, gauge=gauge, last=last)
+        """With a change (M, 3) of the coordinates of some rows, of which an inverse depth keeps a share.
+
+        The measurements of a far point may want its inverse depth negative: then it goes away, step by step. Nor does
+        a step, which has no meaning so far from where it is linear, put it beside the camera that saw it first.
+        """
+        columns = [column.copy() for column in (self.c, self.points, self.D, self.gauge)]
+        moved = charted(coordinates.inverse_depth, self.anchors[rows], self.c[rows], np.ascontiguousarray(change))
+        for column, values in zip(columns, moved):
+            column[rows] = values
+        c, points, D, gauge = columns
+        return changed(self, c=c, points=points, D=D, gauge=gauge, last=self.last.copy())
 
 
 @dataclass(frozen=True)

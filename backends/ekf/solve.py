@@ -184,10 +184,12 @@ def _iterate(at: Linearisation, used: BoolArray) -> Correction:
 
 def _linear(found: Correction, there: Linearisation) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
-    now, sigma = found.at, found.at.update.sigma
-    errors = there.z - now.z - now.differential(found.change - now.change)
+    now, update = found.at, found.at.update
+    step = (found.change - now.change)[update.numbers]
+    as_seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
+    errors = there.z - now.z - (now.own @ as_seen[:, :, None])[:, :, 0]
     errors = np.where(now.seen & found.used[:, None], errors, 0.0)
-    if not np.abs(errors).max() < _LINEAR * sigma:
+    if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
     shift = found.white(errors.reshape(-1)) @ found.white_pose
     return bool((shift**2 <= _POSE_SHARE**2 * found.pose_covariance.diagonal()).all())

@@ -104,11 +104,11 @@ def test_coordinates_there_and_back(coordinates):
     anchors = np.concatenate([se3.so3_exp(rng.standard_normal((5, 3))), rng.standard_normal((5, 3, 1))], axis=2)
     local = rng.uniform((-2, -2, 1), (2, 2, 60), (5, 3))
     points = (anchors[:, :, :3] @ local[:, :, None])[:, :, 0] + anchors[:, :, 3]
-    c = coordinates.of(anchors, points)
-    _, found, Ds, gauges = coordinates.charted(anchors, c)
-    np.testing.assert_allclose(found, points, atol=1e-10)
-    for i, (D, gauge) in enumerate(zip(Ds, gauges)):
-        numeric = jacobian(lambda x, i=i: coordinates.charted(anchors[[i]], x[None])[1][0], c[i], 1e-6 * abs(c[i, 2]))
+    marks = FilterLandmarks.at(coordinates, np.arange(5), anchors, points, 0)
+    place = lambda change: marks.moved(coordinates, slice(None), change).points  # noqa: E731
+    np.testing.assert_allclose(place(np.zeros((5, 3))), points, atol=1e-10)
+    for i, (D, gauge) in enumerate(zip(marks.D, marks.gauge)):
+        numeric = jacobian(lambda x, i=i: place(np.tile(x, (5, 1)))[i], np.zeros(3), 1e-6 * abs(marks.c[i, 2]))
         np.testing.assert_allclose(D, numeric, rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(D @ gauge, np.hstack([np.eye(3), -se3.hat(points[i])]), atol=1e-10)
 
@@ -356,9 +356,9 @@ def far_in_depth(seed: int) -> tuple[FilterState, Update, np.ndarray]:
     anchors = np.tile(np.eye(3, 4), (n, 1, 1))
     c = Coordinates(True).of(anchors, points)
     off = np.stack([np.full(n, 1e-3), np.full(n, 1e-3), 0.2 * c[:, 2]], axis=1)
-    known = Coordinates(True).charted(anchors, c, off * rng.standard_normal((n, 3)).clip(-2.5, 2.5))[1]
+    marks = FilterLandmarks.at(Coordinates(True), np.arange(n), anchors, points, 0)
+    marks = marks.moved(Coordinates(True), slice(None), off * rng.standard_normal((n, 3)).clip(-2.5, 2.5))
     P = np.diag(np.concatenate([sigma**2, np.full(6, 0.01), off.ravel() ** 2]))
-    marks = FilterLandmarks.at(Coordinates(True), np.arange(n), anchors, known, 0)
     s = replace(s, landmarks=marks, covariance=covariance_of(P))
     return s, update_of(s, z, Coordinates(True), EkfConfig().iterations, 1 - 1e-9), truth
 
@@ -464,7 +464,7 @@ def test_a_landmark_slides_across_its_line_of_sight_with_the_angle_of_view(coord
         added = dense(after.covariance) - dense(before.covariance)
         for row in range(4):
             at = slice(CAMERA + 3 * row, CAMERA + 3 * row + 3)
-            D = coordinates.charted(s.landmarks.anchors[row : row + 1], s.landmarks.c[row : row + 1])[2][0]
+            D = s.landmarks.D[row]
             across = (
                 slide.density**2 * by[row] * ((sight[row] @ sight[row]) * np.eye(3) - np.outer(sight[row], sight[row]))
             )
