@@ -237,14 +237,9 @@ class Correction:
         if others.any():
             W = self.white(at.S[:, others])
             off[~used] = (at.nu[others] - self.white(at.nu) @ W).reshape(-1, 3)
-            blocks[~used] = diagonal_blocks(at.S[others][:, others] - W.T @ W)
+            conditional = at.S[others][:, others] - W.T @ W
+            blocks[~used] = np.einsum("iaib->iab", conditional.reshape(len(W.T) // 3, 3, -1, 3))
         found = squared_distances(off, blocks)
         if not np.isfinite(found).all():
             raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
         return found
-
-
-def diagonal_blocks(A: Array) -> Array:
-    """Blocks (M, 3, 3) on the diagonal of A (3M, 3M)."""
-    each = np.arange(len(A) // 3)
-    return np.asarray(A.reshape(len(each), 3, len(each), 3)[each, :, each])

@@ -25,7 +25,7 @@ from scipy.linalg.lapack import dpotrf
 
 from backends.ekf.camera import from_body_axes, prior
 from backends.ekf.covariance import CAMERA, HEAD, POSE
-from backends.ekf.innovation import Correction, Linearisation, Update, diagonal_blocks
+from backends.ekf.innovation import Correction, Linearisation, Update
 from slam.data import BoolArray
 from slam.geometry import se3
 from slam.geometry.arrays import changed
@@ -110,7 +110,7 @@ def gate(update: Update, T: Array | None = None) -> Gated:
     """
     at = update.linearised(None if T is None else update.camera.at(T))
     limits = update.measure.limits(update.z)
-    own = squared_distances(at.nu.reshape(-1, 3), diagonal_blocks(at.S))
+    own = squared_distances(at.nu.reshape(-1, 3), np.einsum("iaib->iab", at.S.reshape(len(at.z), 3, -1, 3)))
     if not np.isfinite(own).all():
         raise LinAlgError("the predicted innovations are not finite or not positive definite")
     distances = np.where(np.isfinite(at.z).all(axis=1), own, np.nan)
