@@ -25,7 +25,7 @@ from scipy.linalg.lapack import dpotrf
 
 from backends.ekf.camera import from_body_axes, prior
 from backends.ekf.covariance import CAMERA, HEAD, POSE
-from backends.ekf.innovation import Correction, Linearisation, Update, diagonal_blocks
+from backends.ekf.innovation import Correction, Linearisation, Update
 from slam.data import BoolArray
 from slam.geometry import se3
 from slam.geometry.arrays import changed
@@ -110,7 +110,7 @@ def gate(update: Update, T: Array | None = None) -> Gated:
     """
     at = update.linearised(None if T is None else update.camera.at(T))
     limits = update.measure.limits(update.z)
-    own = squared_distances(at.nu.reshape(-1, 3), diagonal_blocks(at.S))
+    own = squared_distances(at.nu.reshape(-1, 3), np.einsum("iaib->iab", at.S.reshape(len(at.z), 3, -1, 3)))
     if not np.isfinite(own).all():
         raise LinAlgError("the predicted innovations are not finite or not positive definite")
     distances = np.where(np.isfinite(at.z).all(axis=1), own, np.nan)
@@ -168,26 +168,26 @@ def _iterate(at: Linearisation, used: BoolArray) -> Correction:
     of the posterior. With it H leaves out what would measure the gauge, and the end is off that by what is of second
     order in a step.
     """
-    update, found = at.update, None
+    update = at.update
     for _ in range(update.iterations):
-        if found is not None:
-            at = update.linearised(found.camera, found.change[HEAD:])
         used = used & at.seen.any(axis=1)
         found = at.solved(used)
         if not np.isfinite(found.change).all() or np.abs((found.change - at.change)[3:6]).max() > np.pi:
             raise LinAlgError("a step is not finite, or turns the camera by more than half a turn")
-        if update.iterations == 1 or _linear(found):
+        if update.iterations == 1:
             return found
-    assert found is not None  # there is one iteration at least
+        at = update.linearised(found.camera, found.change[HEAD:])
+        if _linear(found, at):
+            return found
     return changed(found, linear=False)
 
 
-def _linear(found: Correction) -> bool:
+def _linear(found: Correction, there: Linearisation) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
     now, update = found.at, found.at.update
     step = (found.change - now.change)[update.numbers]
     as_seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
-    errors = update.pixels_from(found.camera, found.change) - now.z - (now.own @ as_seen[:, :, None])[:, :, 0]
+    errors = there.z - now.z - (now.own @ as_seen[:, :, None])[:, :, 0]
     errors = np.where(now.seen & found.used[:, None], errors, 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
