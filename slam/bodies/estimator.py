@@ -29,7 +29,6 @@ from slam.window.solver import Solution, linearised, solve
 from slam.window.stereo import RectifiedStereo
 
 FRAMES = 4  #: cost: frames of a window; older ones are marginalised
-_LEAST = 2  # points that must agree with a body that has more: one agrees with some pose always
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,9 +175,8 @@ class BodyEstimator:
         )  # fmt: skip
         motion = carried(b, cameras, self.models)
         limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.gate)
-        enough = max(seen.least, min(_LEAST, (int(b.alive.sum()) + 1) // 2))
         while True:  # without those that disagree with the others
-            if used.sum() < enough:
+            if used.sum() < seen.least:
                 return None, ids[:0], ids
             tried = changed(b, rows=b.rows.joined(Rows.of(len(b) - 1, rows[used], z[used], self.sigma)))
             solution = solve(window(tried, self.stereo, motion))
