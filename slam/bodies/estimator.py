@@ -175,8 +175,10 @@ class BodyEstimator:
         )  # fmt: skip
         motion = carried(b, cameras, self.models)
         limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.gate)
+        # one point agrees with some pose always
+        enough = max(seen.least, min(MINIMAL_POINTS - 1, (int(b.alive.sum()) + 1) // 2))
         while True:  # without those that disagree with the others
-            if used.sum() < seen.least:
+            if used.sum() < enough:
                 return None, ids[:0], ids
             tried = changed(b, rows=b.rows.joined(Rows.of(len(b) - 1, rows[used], z[used], self.sigma)))
             solution = solve(window(tried, self.stereo, motion))
