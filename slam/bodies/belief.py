@@ -2,8 +2,7 @@
 
 How sure it is that a body exists follows from the frames in which it was measured and those in which it was not: the
 recursion of integrated probabilistic data association (Mušicki, Evans and Stanković, IEEE Transactions on Automatic
-Control 39, 1994). A measurement counts the more, the better the body's motion explains its points compared with a still
-world.
+Control 39, 1994). Whether it moves is another question, see `slam.bodies.proof`.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from slam.window.problem import Motion, RelativePrior, Rows, Window
 from slam.window.stereo import RectifiedStereo
 
 EVEN = 0.5  #: fixed: a body rather exists than not above this probability, which it has before its first evidence
-_LEAST = 2.0  # ratio of the likelihoods of a measured body, at least: a body at rest shows no motion, but is there
 _CERTAIN = 1.0 - 1e-9  # a probability of 1 could never fall again
 
 
@@ -37,12 +35,9 @@ def compact(points: Array) -> BoolArray:
     return np.asarray(distance <= _FAR * np.median(distance) if len(points) else np.zeros(0, bool))
 
 
-def when_measured(probability: float, gain: float) -> float:
-    """The probability after a frame that measured the body, which explains a member better than the world by `gain`.
-
-    No gain counts for more than is clear: many members share one error of the camera's pose.
-    """
-    ratio = max(_LEAST, math.exp(0.5 * min(gain, CLEAR)))
+def when_measured(probability: float) -> float:
+    """The probability after a frame that measured the body: it is clear then that there is something."""
+    ratio = math.exp(0.5 * CLEAR)
     return min(_CERTAIN, probability * ratio / (1.0 - probability + probability * ratio))
 
 
@@ -53,7 +48,6 @@ def when_missed(probability: float, seen: int, age: int) -> float:
 
 
 _EXACT = 1e-12 * np.eye(6)  # numerics: [rad², m²]
-_TURN = 0.01  # cost: a point is seen from elsewhere by no less [rad]; what is less adds up
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +60,7 @@ class Points(Table):
     failures: IdArray  # how often running each was rejected (N,)
     unseen: IdArray  # frames since each was seen (N,)
     first: Array  # direction (N, 3) from which each was seen first, in body coordinates
-    turned: Array  # largest angle between that and later ones (N,) [rad], as far as it is allowed for
+    turned: Array  # largest angle between that and later ones (N,) [rad] that the prior allows for
 
     @classmethod
     def new(cls, ids: IdArray, position: Array, local: Array, eye: Array) -> Points:
@@ -178,19 +172,17 @@ def _drifted(prior: RelativePrior, b: BodyBelief, density: float) -> tuple[Relat
     A feature is found where the image looks like it; seen from farther round than ever before, that is elsewhere on the
     body. The first two coordinates of a point in its chart are its direction.
     """
-    p = b.points
-    cosine = np.einsum("ni,ni->n", p.first, _directions(p.position, b.poses[-1][:3, 3]))
-    turned = np.maximum(p.turned, np.arccos(np.clip(cosine, -1, 1)))
-    more = (turned - p.turned)[prior.points]
-    far = np.flatnonzero(more > _TURN)
-    if not len(far) or not density:
+    p, of = b.points, prior.points
+    if not density:
         return prior, p.turned
-    out = p.turned.copy()
-    out[prior.points[far]] = turned[prior.points[far]]
+    cosine = np.einsum("ni,ni->n", p.first[of], _directions(p.position[of], b.poses[-1][:3, 3]))
+    more = np.maximum(np.arccos(np.clip(cosine, -1, 1)) - p.turned[of], 0.0)
+    turned, far = p.turned.copy(), np.flatnonzero(more)
+    turned[of] += more
     at = (3 * far[:, None] + np.arange(2)).reshape(-1)
     S = np.diag(1.0 / np.repeat(density**2 * more[far], 2)) + prior.information[np.ix_(at, at)]
     gain = np.linalg.solve(S, prior.information[at]).T
     information = prior.information - gain @ prior.information[at]
     return changed(
         prior, information=0.5 * (information + information.T), vector=prior.vector - gain @ prior.vector[at]
-    ), out
+    ), turned
