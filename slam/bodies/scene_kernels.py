@@ -16,7 +16,7 @@ from slam.runtime.compilation import disjoint_helper, helper, kernel
 
 PRIOR = np.array([1e-4] * 3 + [1e-6] * 3)  #: keeps Λ of nearly collinear tracks invertible [1/rad², 1/m²]
 _PULL = 16.0  # no track brings more χ² than this: single false ones find no company
-_SOFT, _SHARP = 3, 2  # numerics: rounds of reweighting: Huber's first, which has one minimum, then a sharper one
+_SOFT, _SHARP = 3, 1  # numerics: rounds of reweighting: Huber's first, which has one minimum, then a sharper one
 LARGEST = 0.4  #: share of all tracks that a body may have: the still world has most
 FITS = 14.2  #: derived: χ²(3) at 99.7 %, of a track and a common motion
 _EXPLAINED = 0.25  # share of χ² that the common motion may leave: an uneven motion is seen by tracks unevenly
@@ -64,23 +64,39 @@ def _by_column(sums, rows, count):
 def _common_motion(sums, columns, members, out):
     """The motion ξ (6,) on which the tracks that are `members` (N,) agree, by reweighted least squares, into `out`."""
     n = len(sums)
-    weight, off, total, factor = np.empty(n), np.empty(n), np.empty(28), np.empty((6, 6))
-    for m in range(n):
-        weight[m] = 1.0 if members[m] else 0.0
-    for k in range(_SOFT + _SHARP):
+    weight, off, total, factor = np.empty(n), np.zeros(n), np.empty(28), np.empty((6, 6))
+    every = np.arange(n)
+    for k in range(1 + _SOFT + _SHARP):
+        _reweigh(off, members, k <= _SOFT, weight)
         total[:] = 0.0
-        for m in range(n):
-            _add_weighted(total, sums[m], weight[m])
+        _add_rows(total, sums, every, weight)
         _factorise(total, 1.0, factor)
         _solve(factor, total[21:27], out)
         _squares_against(columns, out, off)
-        _reweigh(off, members, k < _SOFT, weight)
 
 
 @disjoint_helper
 def _add_weighted(total, part, weight):
-    for k in range(len(total)):
+    for k in range(28):
         total[k] += weight * part[k]
+
+
+@helper
+def _add_rows(total, parts, rows, weight):
+    """Add the `rows` (M,) of `parts` (N, 28), each times its `weight` (N,)."""
+    n = len(rows)
+    for m in range(0, n - 3, 4):
+        a, b, c, d = rows[m], rows[m + 1], rows[m + 2], rows[m + 3]
+        _add_four(total, parts[a], parts[b], parts[c], parts[d], (weight[a], weight[b], weight[c], weight[d]))
+    for m in range(n - n % 4, n):
+        _add_weighted(total, parts[rows[m]], weight[rows[m]])
+
+
+@disjoint_helper
+def _add_four(total, a, b, c, d, weight):
+    """What is loaded and stored once serves four tracks."""
+    for k in range(28):
+        total[k] += (weight[0] * a[k] + weight[1] * b[k]) + (weight[2] * c[k] + weight[3] * d[k])
 
 
 @disjoint_helper
@@ -208,13 +224,27 @@ def _full_windows(codes, sizes, least):
 
 
 @helper
-def _gain(triangle, gradient, factor, work):
-    """By how much a triangle's tracks fit better with a motion of their own, from the gradient (6,) at another."""
-    _factorise(triangle, 1.0, factor)
-    _solve(factor, gradient, work)
-    total = 0.0
+def _gain(triangle, gradient, lower, scaled):
+    """By how much a triangle's tracks fit better with a motion of their own, from the gradient (6,) at another.
+
+    With the matrix ``L D Lᵀ`` and ``z = L⁻¹ g`` that is ``zᵀ D⁻¹ z``. `lower` (6, 6) holds L, and D⁻¹ on its diagonal,
+    `scaled` (6, 7) L D, and z in its last column.
+    """
+    total, k = 0.0, 0
     for i in range(6):
-        total += gradient[i] * work[i]
+        for j in range(i):
+            value = triangle[k]
+            for h in range(j):
+                value -= scaled[i, h] * lower[j, h]
+            scaled[i, j], lower[i, j] = value, value * lower[j, j]
+            k += 1
+        z, d = gradient[i], triangle[k] + PRIOR[i]
+        for h in range(i):
+            z -= lower[i, h] * scaled[h, 6]
+            d -= scaled[i, h] * lower[i, h]
+        k += 1
+        lower[i, i], scaled[i, 6] = 1.0 / d, z
+        total += z * z * lower[i, i]
     return total
 
 
@@ -233,8 +263,9 @@ def _window_tests(starts, tracks, sums, columns, alone, scale, rest, asked, supp
         if rest[m]:
             weight[m] = min(1.0, _PULL / max(alone[m], 1e-9)) / scale
             _add_weighted(total, sums[m], weight[m])
-    factor, motion, shares, whole = np.empty((6, 6)), np.empty(6), np.empty(21), np.empty((6, 6))
-    inside, outside, gradient, column, unit = np.empty(28), np.empty(21), np.empty(6), np.empty(6), np.zeros(6)
+    factor, motion, shares = np.empty((6, 6)), np.empty(6), np.empty(21)
+    inside, outside, column, unit = np.empty(28), np.empty(21), np.empty(6), np.zeros(6)
+    gradient, whole, lower, scaled = np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 7))
     _factorise(total, 2.0, factor)
     _solve(factor, total[21:27], motion)
     _squares_against(columns, motion, off)
@@ -262,19 +293,18 @@ def _window_tests(starts, tracks, sums, columns, alone, scale, rest, asked, supp
         if size < support or size > largest or most <= asked[size] * (1.0 - share):
             continue
         inside[:] = 0.0
-        for m in own:
-            _add_weighted(inside, sums[m], weight[m])
+        _add_rows(inside, sums, own, weight)
         _unfold(inside, 0.0, whole)
         for i in range(6):
             gradient[i] = PRIOR[i] * motion[i] - inside[21 + i]
             for j in range(6):
                 gradient[i] += whole[i, j] * motion[j]
-        value = _gain(inside, gradient, factor, column)
+        value = _gain(inside, gradient, lower, scaled)
         if value <= asked[size] * (1.0 - share):
             continue
         for k in range(21):  # expressions of arrays take seconds to compile
             outside[k] = total[k] - inside[k]
-        value += _gain(outside, gradient, factor, column) - asked[size]
+        value += _gain(outside, gradient, lower, scaled) - asked[size]
         if value > 0.0:
             clear[w] = value
 
