@@ -126,7 +126,7 @@ def prior(models: EstimatorModels, pose: tuple[float, float] | None = None) -> A
 
 
 def _any_attitude(models: EstimatorModels, P: Array, dt: float) -> bool:
-    """Whether a camera, by its error's covariance P (12, 12), may have turned anyhow in the last `dt` [s], or before."""
+    """Whether a camera, by its error's covariance P (12, 12), may have turned anyhow in the last `dt` [s] or before."""
     attitude, rate = np.arange(3, 6), np.arange(9, 12)
     turned = 2 * dt * P[attitude, rate] + dt * dt * (P[rate, rate] + models.motion.velocity_variance(dt)[1])
     return bool(turned.max() > _ANY_TURN**2 or (P[attitude, attitude] + turned).max() > _ANY_ATTITUDE**2)
