@@ -170,15 +170,26 @@ def mutual_best(products, d_match, ratio):
 @kernel
 def _near(looks, signs, feature_looks, feature_signs, places, variances, points, noise, metres, sigmas, d_match, ratio):
     """The features (M,) that belong to tracks as in `best_pairs`, −1 for none: see `match_near`."""
-    count, far = len(looks), np.float32(-np.inf)
+    count, far, size = len(looks), np.float32(-np.inf), 0
     best, most = np.full(count, -1, np.intp), np.empty((count, 2), np.float32)
+    candidates, deviation = np.empty(len(points), np.intp), np.empty(len(points))
+    for m in range(len(points)):
+        if np.isfinite(points[m, 0]):
+            candidates[size], deviation[size] = m, np.sqrt(noise[m])
+            size += 1
     for n in range(count):
         first = second = far
-        for m in range(len(points)):
-            if feature_signs[m] != signs[n]:
-                continue
+        own = metres + sigmas * np.sqrt(variances[n])
+        for c in range(size):
+            m, largest = (
+                candidates[c],
+                own + sigmas * deviation[c],
+            )  # at most: roots add up to more
             x, y, z = points[m, 0] - places[n, 0], points[m, 1] - places[n, 1], points[m, 2] - places[n, 2]
-            if np.sqrt(x * x + y * y + z * z) < metres + sigmas * np.sqrt(variances[n] + noise[m]):  # NaN is not
+            square = x * x + y * y + z * z
+            if not square < largest * largest or feature_signs[m] != signs[n]:
+                continue
+            if np.sqrt(square) < metres + sigmas * np.sqrt(variances[n] + noise[m]):
                 p = product(looks[n], feature_looks[m])
                 if p > second:
                     second = min(p, first)
