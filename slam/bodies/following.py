@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from slam.bodies.belief import BodyBelief
 from slam.bodies.bodies import Body, of_bodies
@@ -93,17 +92,15 @@ def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
     s, c = frame.setup, frame.setup.config
     left = np.flatnonzero((tracks.number >= 0) & (tracks.row < 0) & (tracks.body < 0) & (tracks.unfound == 0))
     left = left[tracks.count(left) <= MIN_FRAMES]
-    free = np.flatnonzero(~taken & np.isfinite(frame.local[:, 0]))
-    if not len(left) or not len(free):
+    if not len(left):
         return
-    local = frame.local[free]
-    deviation = np.sqrt(2.0) * s.depth_noise(local[:, 2])
-    unknown = SIGMAS * np.sqrt(np.einsum("nii->n", tracks.covariance[left])[:, None] + deviation**2)
-    away = cdist(tracks.position[left], transform(frame.T_world_left, local))
-    allowed = away < c.max_speed * frame.dt + unknown
-    looks, features = (tracks.look[left], tracks.laplacian[left]), frame.features.select(free)
-    found = features_of_tracks.match_everywhere(*looks, features, *_ALIKE, allowed)
-    tracks.set_features(left[found.tracks], free[found.features])
+    points = transform(frame.T_world_left, np.where(taken[:, None], np.nan, frame.local))
+    places, variances = tracks.position[left], np.einsum("nii->n", tracks.covariance[left])
+    found = features_of_tracks.match_near(
+        tracks.look[left], tracks.laplacian[left], places, variances, frame.features, points,
+        2.0 * s.depth_noise(frame.local[:, 2]) ** 2, (c.max_speed * frame.dt, SIGMAS), *_ALIKE,
+    )  # fmt: skip
+    tracks.set_features(left[found.tracks], found.features)
 
 
 def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) -> BodyBelief | None:

@@ -61,10 +61,9 @@ def follow(
 
 
 def match_everywhere(
-    descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures, d_match: float, ratio: float,
-    allowed: BoolArray | None = None,
-) -> Matches:  # fmt: skip
-    """Recognise tracks (M, D) by descriptor alone, wherever they lie in the image, or in pairs `allowed` (M, N).
+    descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures, d_match: float, ratio: float
+) -> Matches:
+    """Recognise tracks (M, D) by descriptor alone, wherever they lie in the image.
 
     Only what has the same sign of the Laplacian is compared: half of the pairs.
     """
@@ -72,9 +71,26 @@ def match_everywhere(
     for sign in (-1, 0, 1):
         rows, columns = (np.flatnonzero(signs == sign) for signs in (laplacian, features.laplacian))
         if len(rows) and len(columns):
-            some = np.ones((0, 0), bool) if allowed is None else allowed[np.ix_(rows, columns)]
-            found = mutual_best(descriptors[rows] @ features.descriptors[columns].T, some, *limits)
+            found = mutual_best(descriptors[rows] @ features.descriptors[columns].T, *limits)
             best[rows] = np.where(found < 0, -1, columns[found])
+    return _matches(best)
+
+
+def match_near(
+    descriptors: Descriptors, laplacian: NDArray[np.int8], places: Array, variances: Array, features: StereoFeatures,
+    points: Array, noise: Array, reach: tuple[float, float], d_match: float, ratio: float,
+) -> Matches:  # fmt: skip
+    """Recognise tracks (M, D) by descriptor among the features whose points lie near their places.
+
+    Places (M, 3) and points (N, 3) [m] have variances (M,) and `noise` (N,) [m²]. They are near if they are less than
+    `reach` apart: so many metres, and so many standard deviations. A feature whose point is NaN is no candidate.
+    """
+    looks = np.ascontiguousarray(descriptors), laplacian, features.descriptors, features.laplacian
+    return _matches(_near(*looks, places, variances, points, noise, *reach, np.float32(d_match), np.float32(ratio)))
+
+
+def _matches(best: NDArray[np.intp]) -> Matches:
+    """The features (M,) that tracks have, −1 for none, as pairs."""
     rows = np.flatnonzero(best >= 0)
     return Matches(rows, best[rows])
 
@@ -131,33 +147,76 @@ def best_pairs(rows, columns, distance, allowed, count, size, d_match, ratio, go
 
 
 @kernel
-def mutual_best(products, allowed, d_match, ratio):
+def mutual_best(products, d_match, ratio):
     """The features (N,) that belong to tracks as in `best_pairs`, −1 for none, wherever they lie.
 
-    Given are the inner products of descriptors, tracks by features (N, M), and which pairs are `allowed` (N, M; all
-    where that is empty).
+    Given are the inner products of descriptors, tracks by features (N, M).
     """
     count, far = len(products), np.float32(-np.inf)
-    best, distance = np.full(count, -1, np.intp), np.empty(count, np.float32)
-    of_column = np.full(products.shape[1], np.inf, np.float32)
+    best, most = np.full(count, -1, np.intp), np.empty((count, 2), np.float32)
     for n in range(count):
         first = second = far
         for m in range(products.shape[1]):
             p = products[n, m]
-            if p > second and (allowed.size == 0 or allowed[n, m]):
+            if p > second:
                 second = min(p, first)
                 if p > first:
                     first, best[n] = p, m
-        distance[n] = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * first, np.float32(0.0)))
-        other = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * second, np.float32(0.0)))
+        most[n, 0], most[n, 1] = first, second
+    _keep_mutual(best, most, products.shape[1], d_match, ratio)
+    return best
+
+
+@kernel
+def _near(looks, signs, feature_looks, feature_signs, places, variances, points, noise, metres, sigmas, d_match, ratio):
+    """The features (M,) that belong to tracks as in `best_pairs`, −1 for none: see `match_near`."""
+    count, far, size = len(looks), np.float32(-np.inf), 0
+    best, most = np.full(count, -1, np.intp), np.empty((count, 2), np.float32)
+    candidates, deviation = np.empty(len(points), np.intp), np.empty(len(points))
+    for m in range(len(points)):
+        if np.isfinite(points[m, 0]):
+            candidates[size], deviation[size] = m, np.sqrt(noise[m])
+            size += 1
+    for n in range(count):
+        first = second = far
+        own = metres + sigmas * np.sqrt(variances[n])
+        for c in range(size):
+            m, largest = (
+                candidates[c],
+                own + sigmas * deviation[c],
+            )  # at most: roots add up to more
+            x, y, z = points[m, 0] - places[n, 0], points[m, 1] - places[n, 1], points[m, 2] - places[n, 2]
+            square = x * x + y * y + z * z
+            if not square < largest * largest or feature_signs[m] != signs[n]:
+                continue
+            if np.sqrt(square) < metres + sigmas * np.sqrt(variances[n] + noise[m]):
+                p = product(looks[n], feature_looks[m])
+                if p > second:
+                    second = min(p, first)
+                    if p > first:
+                        first, best[n] = p, m
+        most[n, 0], most[n, 1] = first, second
+    _keep_mutual(best, most, len(points), d_match, ratio)
+    return best
+
+
+@helper
+def _keep_mutual(best, most, columns, d_match, ratio):
+    """Of each row's `best` column (N,), keep those as in `best_pairs`, −1 for others, in place.
+
+    `most` (N, 2) are a row's two largest inner products.
+    """
+    distance, of_column = np.empty(len(best), np.float32), np.full(columns, np.inf, np.float32)
+    for n in range(len(best)):
+        distance[n] = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * most[n, 0], np.float32(0.0)))
+        other = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * most[n, 1], np.float32(0.0)))
         if not (distance[n] < d_match and distance[n] < ratio * other):
             best[n] = -1
         elif distance[n] < of_column[best[n]]:  # a row that would not take it has no claim to a column
             of_column[best[n]] = distance[n]
-    for n in range(count):
+    for n in range(len(best)):
         if best[n] >= 0 and distance[n] > of_column[best[n]]:
             best[n] = -1
-    return best
 
 
 @helper

@@ -8,7 +8,7 @@ import pytest
 from slam.data import Prediction, StereoFeatures
 from slam.geometry import se3
 from slam.tracks.config import AssociationConfig
-from slam.tracks.follow import Windows, follow, match_everywhere
+from slam.tracks.follow import Windows, follow, match_everywhere, match_near
 from tests.slam.scene import RIG, Cloud
 
 CONFIG = AssociationConfig()
@@ -65,14 +65,22 @@ def test_windows_are_the_innovations_ellipses(sigma):
     np.testing.assert_array_equal(inside[clear], (squared <= 25.0)[clear])
 
 
-def test_everywhere_keeps_to_the_pairs_that_are_allowed():
+def test_looks_are_sought_among_points_that_are_near_enough():
+    """Within so many metres and standard deviations; and what is no candidate is no rival either."""
     cloud = Cloud()
     features, ids = cloud.features(np.eye(4), 0.0)
-    allowed = np.ones((len(ids), len(ids)), bool)
-    allowed[3] = False
     matches = match_everywhere(cloud.descriptors, cloud.laplacian, features, *WIDE)
     np.testing.assert_array_equal(matches.tracks, ids[matches.features])
-    matches = match_everywhere(cloud.descriptors[ids], cloud.laplacian[ids], features, *WIDE, allowed)
+    points, none, off = cloud.points[ids], np.zeros(len(ids)), np.array([0.0, 0.3, 0.4])
+    places, variances = points + off, none.copy()
+    points[3] = np.nan
+    variances[5:] = 0.03**2  # 0.4 + 4 0.03 m are enough
+    variances[:5], places[:5] = 0.02**2, points[:5] + off
+    places[4], places[3] = points[4], points[4]  # 3 would be at 4 as well, but does not look like it
+    tracks = cloud.descriptors[ids], cloud.laplacian[ids], places, variances
+    matches = match_near(*tracks, features, points, none, (0.4, 4.0), *WIDE)
+    assert matches.tracks.tolist() == matches.features.tolist() == list(range(4, len(ids)))
+    matches = match_near(*tracks, features, points, none + 0.03**2 - variances, (0.4, 4.0), *WIDE)
     assert matches.tracks.tolist() == np.delete(np.arange(len(ids)), 3).tolist()
 
 
