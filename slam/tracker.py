@@ -302,11 +302,12 @@ def frame_result(
     if atlas.anchor is None:  # the pose as reported has another error by the rig than in the present path
         covariance = estimate.covariance + common.covariance - step.common.covariance
         estimate = changed(estimate, covariance=0.5 * (covariance + covariance.T))
+    estimate = changed(estimate, T_world_left=estimate.T_world_left.copy())  # the caller may write into it
     return FrameResult(
         step.index, status, reason, estimate, step.report, step.features,
         len(step.prediction.ids), step.matches.ids, step.matches.rows, step.added.ids, step.added.rows, step.erased,
         len(step.tracks.mapped), dict(milliseconds), step.labels.moving, objects, revision=revision,
-        T_map_odom=atlas.T_map_odom, loop=loop, refused_loop=refused_loop,
+        T_map_odom=atlas.T_map_odom.copy(), loop=loop, refused_loop=refused_loop,
         keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index,
         returned=step.joined,
         common=common,

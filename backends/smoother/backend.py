@@ -120,7 +120,7 @@ class SmootherBackend:
         """The last camera poses, at most n and as many as are in the graph, with their joint covariance."""
         s, n = self._started("recent"), require_recent("smoother", n)
         first, P = self._graph.joint_covariance(s, s.number + 1 - n)
-        return RecentPoses(s.stamps[s.of(first) :], s.poses[s.of(first) :], 0.5 * (P + P.T))
+        return RecentPoses(s.stamps[s.of(first) :].copy(), s.poses[s.of(first) :].copy(), 0.5 * (P + P.T))
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:

@@ -22,6 +22,7 @@ from slam.compare.plan import CLOSED_LOOP, REPLAY, SIMULATED, Plan, Trial
 from slam.compare.trial import RECORDING, Run, config_of, run_trial
 from slam.errors import SlamError
 from slam.files import noting_inputs, read_object
+from slam.geometry.stamps import frame_range
 from slam.input.features import Rectification
 from slam.outputs import Output, require_outputs
 from slam.run.options import versions
@@ -127,7 +128,8 @@ def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
             if trial.seed:
                 continue
             sequence = open_sequence(trial.source, quiet=trial.sequence in frames)
-            frames[trial.sequence] = len(range(len(sequence))[trial.start : trial.stop])
+            first, last = frame_range(trial.start, trial.stop, len(sequence))
+            frames[trial.sequence] = last - first
             config = config_of(trial, sequence)
             if plan.frontend != SIMULATED:
                 registry.create("frontends", plan.frontend, sequence.rig, **config.frontend)

@@ -93,6 +93,15 @@ def test_a_defect_is_an_outcome_and_a_worker_that_is_killed_ends_it_with_what_is
     assert outcomes == {"smoother": "completed", "iekf": "failed: ZeroDivisionError: a defect"}
 
 
+@pytest.mark.parametrize("frames", ["3:1", "4:9"])
+def test_frames_that_there_are_none_of_are_refused_before_anything_is_run_or_written(frames, tmp_path):
+    out = tmp_path / "out"
+    words = ["compare", "synthetic:desk?frames=4", "--frontend", "simulated", "--trials", "1", "--out", str(out)]
+    with pytest.raises(SlamError, match=f"frames {frames} asked for"):
+        command(*words, "--backends", "ekf", "--frames", frames)
+    assert not out.exists()
+
+
 def test_what_is_done_is_not_done_again_and_what_is_not_is(done, again):
     kept, lost, damaged = (again / RUNS / trial.folder for trial in PLAN.every[:3])
     (kept / "marker").touch()
