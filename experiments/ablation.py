@@ -38,8 +38,7 @@ BACKENDS = ("ekf", "smoother")  # whose parts are switched off
 _LONG = 100  # frames from which a sequence comes last
 #: What was decided by these tables, without figures: they are above it.
 FOLLOWED = """
-The ratios of `smoother` are alike. Patch alignment is on for handheld cameras; recorded drives are no better with it.
-The detector stays for the bodies that it finds.
+The ratios of `smoother` are alike. The detector stays for the bodies that it finds.
 """
 COLUMNS = ("without", "error", "largest", "larger in", "NEES", "CPU")
 HEADER = ("sequence", "trial", "back end", "variant", "error", "NEES", "frames", "lost", "ms")

@@ -45,11 +45,10 @@ KINDS = {
 }
 
 SENSITIVITY = """\
-The columns ½ and 2 are for half and twice the number: the error of the camera's position and of the bodies' motion,
-over that with the default; the worst back end, geometric mean over short runs of {cases} (`python
-experiments/sensitivity.py`); of numbers that were measured before the last two were added, over the others. A number
-changes a result if one of these is beyond the scatter under small perturbations of the pixels, factors of {camera:.2f}
-and {bodies:.2f}, or if a run fails.
+The columns ½ and 2 are for half and twice the number: errors of the camera's position and of the bodies' motion, over
+the default's; the worst back end, geometric mean over short runs of {cases} (older ones: without the last two; `python
+experiments/sensitivity.py`). A number changes a result where that is beyond the scatter under small perturbations of
+the pixels, factors of {camera:.2f} and {bodies:.2f}, or a run fails.
 """
 
 #: What a number does at half or twice its value, by column of the summary.
