@@ -50,8 +50,8 @@ class Covariance:
     """Of ``[camera (12), last poses (24), the pose that landmarks left (6), N landmarks (3N)]``, n numbers.
 
     The last poses are perturbed on the right, the newest first; zero before there are so many. The error of the pose
-    that landmarks left is a displacement of the world; see `backends.ekf.state.FilterState`. Rows of the table of
-    landmarks are in this order; behind them are those that are apart.
+    that landmarks left is a displacement of the world, zero (the world itself) before one has left; see
+    `backends.ekf.state.FilterState`. Rows of landmarks are in this order; behind them are those that are apart.
     """
 
     P: Array  # (n, n)

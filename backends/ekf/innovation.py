@@ -86,8 +86,7 @@ class Update:
             change[:CAMERA] = np.linalg.solve(J, there.minus(self.camera))
         if moved is not None:
             change[HEAD:] = moved
-            asked = change[self.numbers[POSE:]].reshape(-1, 3)
-            marks = marks.moved(self.coordinates, slice(None), asked)
+            marks = marks.moved(self.coordinates, slice(None), change[self.numbers[POSE:]].reshape(-1, 3))
             change[self.numbers[POSE:]] = (marks.c - self.landmarks.c).reshape(-1)  # a coordinate may be at its limit
         R, r = there.pose[:3, :3], there.pose[:3, 3]
         z, by_point = self.measure.stereo.project((marks.points - r) @ R)

@@ -23,9 +23,9 @@ def charted(inverse, anchors, c, change):
     out, points, D, gauge = np.empty_like(c), np.empty_like(c), np.zeros((len(c), 3, 3)), np.zeros((len(c), 3, 6))
     by_local, back, ray = np.zeros((3, 3)), np.zeros((3, 3)), np.empty(3)
     for m in range(len(c)):
-        R, y = anchors[m], out[m]
+        R, y, x = anchors[m], out[m], points[m]
         for i in range(3):
-            y[i] = points[m, i] = c[m, i] + change[m, i]
+            y[i] = x[i] = c[m, i] + change[m, i]
             D[m, i, i] = gauge[m, i, i] = 1.0
         if inverse:
             for i in range(2):
@@ -40,10 +40,9 @@ def charted(inverse, anchors, c, change):
                 by_local[i, 2], back[i, 2] = -ray[i] / w, -y[i] * w
             multiply(R, by_local, D[m])
             for i in range(3):
-                points[m, i] = row_times(R, i, ray) + R[i, 3]
+                x[i] = row_times(R, i, ray) + R[i, 3]
                 for j in range(3):
                     gauge[m, i, j] = row_times(back, i, R[j])
-        x = points[m]
         for i in range(3):  # D⁻¹ [1, −hat(x)]
             g = gauge[m, i]
             g[3], g[4], g[5] = g[2] * x[1] - g[1] * x[2], g[0] * x[2] - g[2] * x[0], g[1] * x[0] - g[0] * x[1]
