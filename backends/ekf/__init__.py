@@ -4,7 +4,7 @@ In the papers' order:
 
 - `camera`: what the filter asks of a camera, and what an error is.
 - `motion`: the camera's state and its transition (paper B, section 2), in angles kept from their singularity.
-- `landmarks`: a landmark's three numbers, and the table of all; `kernels`: what is compiled of it and the rest.
+- `landmarks`: a landmark's three numbers, and the table of all.
 - `innovation`: measurement, ν and S (A, Eqs. 5-7; B, Eqs. 1-5); `solve`: gate, the update of the mean (A, Eq. 11), and
   what else is tried where it fails.
 - `covariance`: ``A P Aᵀ + W Q Wᵀ`` (B, section 2), landmarks that join (A, Eq. 10), ``P − K S Kᵀ`` (A, Eq. 11).

@@ -18,16 +18,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.blas import dsyr2k, dsyrk
 
-from backends.ekf.kernels import mirror, reordered
 from slam.data import IndexArray
 from slam.geometry.arrays import Table, changed
 from slam.geometry.se3 import Array
+from slam.runtime.compilation import kernel
 
 CAMERA = 12  #: fixed: size of the camera's state [r, φ, v, ω]
 POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 RECENT = 4  #: cost: poses before the present one that are kept
 HEAD = CAMERA + POSE * (RECENT + 1)  #: fixed: size of camera and past poses, behind which the landmarks stand
 LEAVING = slice(HEAD - POSE, HEAD)  #: fixed: where the last of these stands, the pose that landmarks left
+_BLOCK = 32  # cost: rows and columns that are mirrored at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +51,8 @@ class Covariance:
     """Of ``[camera (12), last poses (24), the pose that landmarks left (6), N landmarks (3N)]``, n numbers.
 
     The last poses are perturbed on the right, the newest first; zero before there are so many. The error of the pose
-    that landmarks left is a displacement of the world; see `backends.ekf.state.FilterState`. Rows of the table of
-    landmarks are in this order; behind them are those that are apart.
+    that landmarks left is a displacement of the world, zero (the world itself) before one has left; see
+    `backends.ekf.state.FilterState`. Rows of landmarks are in this order; behind them are those that are apart.
     """
 
     P: Array  # (n, n)
@@ -176,17 +177,17 @@ class Covariance:
         Args:
             V: ``K S Kᵀ = V Vᵀ`` (n, ·).
             by_rig: what errors of the rig change in the update (n, m), as derivatives.
-            J: the corrected camera's error is J (12, 12) times that of the camera before; its velocities move no other.
+            J: the corrected camera's error is J (12, 12) times that of the camera before.
             shift: the error of a corrected landmark is what it was plus its shift (N, 3, 6) times that of the pose.
         """
-        last, by_rig, D = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), POSE))
+        last, by_rig, D = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), CAMERA))
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
         mirror(P, CAMERA)
-        D[:CAMERA], D[HEAD:] = (J - np.eye(CAMERA))[:, :POSE], shift.reshape(-1, POSE) @ J[:POSE, :POSE]
-        # F P Fᵀ = P + D Yᵀ + Y Dᵀ, with F = 1 + [D, 0] and Y = P[:, :6] + D P_pp / 2
-        half = 0.5 * D @ P[:POSE, :POSE]
-        P = dsyr2k(1.0, D, P[:, :POSE] + half, 1.0, P.T, overwrite_c=1).T
-        by_rig += D @ by_rig[:POSE]
+        D[:CAMERA], D[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
+        # F P Fᵀ = P + D Yᵀ + Y Dᵀ, with F = 1 + [D, 0] and Y = P[:, :12] + D P_cc / 2
+        half = 0.5 * D @ P[:CAMERA, :CAMERA]
+        P = dsyr2k(1.0, D, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
+        by_rig += D @ by_rig[:CAMERA]
         P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]
         summands = self.P.diagonal() + 2 * (half * D).sum(axis=1)
         summands[last] = 0.0
@@ -204,6 +205,26 @@ class Covariance:
         moved = changed(self, by_rig=by_rig, apart=changed(self.apart, by_rig=apart))
         nothing = np.zeros((len(self.P), 0))
         return moved.corrected(nothing, 0 * by_rig, np.eye(CAMERA), shift)
+
+
+@kernel
+def mirror(P: Array, n: int) -> None:
+    """The lower triangle of the first n rows and columns of P also above its diagonal, in place."""
+    for first in range(0, n, _BLOCK):
+        for left in range(0, first + 1, _BLOCK):
+            for i in range(first, min(first + _BLOCK, n)):
+                for j in range(left, min(left + _BLOCK, i)):
+                    P[j, i] = P[i, j]
+
+
+@kernel
+def reordered(P: Array, order: IndexArray) -> Array:
+    """P (n, n) with its rows and columns in an order (k,)."""
+    out = np.empty((len(order), len(order)))
+    for i in range(len(order)):
+        for j in range(len(order)):
+            out[i, j] = P[order[i], order[j]]
+    return out
 
 
 def positive(P: Array, summands: Array, terms: int) -> Array:

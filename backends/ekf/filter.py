@@ -109,8 +109,8 @@ class LandmarkFilter:
         T, P, rows = s.pose.copy(), s.pose_covariance(), s.landmarks.order
         if not landmarks:
             return Estimate(s.stamp, T, P, rows[:0], np.zeros((0, 3)), np.zeros((0, 3, 3)))
-        own, marks = s.covariance.marginals(rows)[0], s.landmarks.select(rows)
-        D = marks.D
+        marks, own = s.landmarks.select(rows), s.covariance.marginals(rows)[0]
+        D = self._coordinates.jacobian(marks.anchors, marks.c)
         C, summands = D @ own @ D.transpose(0, 2, 1), (D * D @ np.einsum("nii->ni", own)[:, :, None])[:, :, 0]
         blocks = positive(0.5 * (C + C.transpose(0, 2, 1)), summands, 9)
         return Estimate(s.stamp, T, P, marks.ids, marks.points, blocks)
@@ -173,9 +173,8 @@ class LandmarkFilter:
         """See `slam.interfaces.ConsideringBackend.sensitivities`."""
         s = self._started("sensitivities")
         rows = s.landmarks.rows_of(ids)
-        return pose_by_error(s.camera) @ s.covariance.by_rig[:POSE], s.landmarks.D[rows] @ s.covariance.marginals(rows)[
-            2
-        ]
+        D = self._coordinates.jacobian(s.landmarks.anchors[rows], s.landmarks.c[rows])
+        return pose_by_error(s.camera) @ s.covariance.by_rig[:POSE], D @ s.covariance.marginals(rows)[2]
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
@@ -223,7 +222,7 @@ class LandmarkFilter:
         rows = self._measure.visible(T, s.landmarks.points)
         after = s.advanced(float(stamp), motion)
         marks, walk = after.landmarks.select(rows), self._slide.walked(after.landmarks, rows, T[:3, 3])[1]
-        toward = T[:3, :3].T @ marks.D
+        toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
         local = toward @ (after.from_camera(rows) + walk) @ toward.transpose(0, 2, 1)
         left, right, S = self._measure.pixels((marks.points - T[:3, 3]) @ T[:3, :3], local)
         prediction = Prediction(after.stamp, T.copy(), after.pose_covariance(), marks.ids, left, right, S)

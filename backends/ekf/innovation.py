@@ -16,8 +16,7 @@ from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from backends.ekf.camera import Camera, displacement, transport
-from backends.ekf.covariance import CAMERA, HEAD, POSE, Covariance
-from backends.ekf.kernels import H_times, reordered
+from backends.ekf.covariance import CAMERA, HEAD, POSE, Covariance, reordered
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.data import BoolArray, IndexArray
 from slam.geometry.arrays import changed
@@ -74,6 +73,12 @@ class Update:
         Z = dpotrs(root, U, lower=1)[0] if info == 0 else np.full(U.shape, np.nan)
         return np.linalg.solve(U.T @ Z, Z.T) if np.isfinite(Z).all() else None
 
+    def pixels_from(self, camera: Camera, change: Array) -> Array:
+        """What a camera would measure (M, 3) [px] of landmarks if the state changes (n,); NaN behind it."""
+        marks, asked = self.landmarks, change[self.numbers[POSE:]].reshape(-1, 3)
+        points = self.coordinates.points(marks.anchors, self.coordinates.moved(marks.c, asked))
+        return self.measure.stereo.project((points - camera.pose[:3, 3]) @ camera.pose[:3, :3])[0]
+
     def linearised(self, camera: Camera | None = None, moved: Array | None = None) -> Linearisation:
         """Linearised at a camera and a change (3N,) of the state's landmarks, by default those of the prior.
 
@@ -92,7 +97,8 @@ class Update:
         R, r = there.pose[:3, :3], there.pose[:3, 3]
         z, by_point = self.measure.stereo.project((marks.points - r) @ R)
         seen = np.isfinite(self.z) & np.isfinite(z).all(axis=1, keepdims=True)
-        own = np.where(seen[:, :, None], by_point @ (R.T @ marks.D), 0.0)
+        own = by_point @ (R.T @ self.coordinates.jacobian(marks.anchors, marks.c))
+        own = np.where(seen[:, :, None], own, 0.0)
         # an error that is transported displaces the world by the same, wherever it is written
         lever = marks.gauge @ displacement(self.camera if self.camera.transports else there)
         return Linearisation(self, there, J, change, z, seen, own, lever)
@@ -130,26 +136,27 @@ class Linearisation:
         return -(self.own @ lever).reshape(-1, POSE), B, G
 
     def H_times(self, X: Array) -> Array:
-        """H (3M, ·) of a matrix X (n, ·), whose rows are of the errors of the state."""
-        (by_pose, B, G), numbers = self._along_the_world, self.update.numbers
-        out = H_times(X, numbers[POSE::3], by_pose, self.own)
-        return np.asarray(out if G is None else out - B @ (G @ X[numbers]))
+        """H (3M, ·) of a matrix X (6 + 3M, ·), whose rows are of the errors of pose and measured landmarks."""
+        by_pose, B, G = self._along_the_world
+        out = by_pose @ X[:POSE]
+        out += (self.own @ X[POSE:].reshape(len(self.own), 3, -1)).reshape(out.shape)
+        return np.asarray(out if G is None else out - B @ (G @ X))
 
     @cached_property
     def nu(self) -> Array:
         """Innovation (3M,) of the prior's mean: ``ν = z − h(x) + H x`` with the change x from the prior to here."""
         left = np.where(self.seen, self.update.z - self.z, 0.0).reshape(-1)
-        return np.asarray(left + self.H_times(self.change[:, None])[:, 0])
+        return np.asarray(left + self.H_times(self.change[self.update.numbers, None])[:, 0])
 
     @cached_property
     def HP(self) -> Array:
         """``H P`` (3M, n), with everything."""
-        return self.H_times(self.update.covariance.P)
+        return self.H_times(self.update.covariance.P[self.update.numbers])
 
     @cached_property
     def S(self) -> Array:
         """``S = H P Hᵀ + R`` (3M, 3M)."""
-        S = self.H_times(np.ascontiguousarray(self.HP.T))
+        S = self.H_times(self.HP[:, self.update.numbers].T)
         S[np.diag_indices(len(S))] += self.update.sigma**2
         return S
 
@@ -219,7 +226,7 @@ class Correction:
         """
         at, update = self.at, self.at.update
         V = dtrmm(1.0, self.L_inverse.T, at.HP[self.taken].T, side=1, overwrite_b=1)
-        by_rig = at.H_times(update.covariance.by_rig)
+        by_rig = at.H_times(update.covariance.by_rig[update.numbers])
         by_rig -= np.where(at.seen[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
         return V, V @ self.white(by_rig)
 

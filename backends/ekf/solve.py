@@ -168,26 +168,26 @@ def _iterate(at: Linearisation, used: BoolArray) -> Correction:
     of the posterior. With it H leaves out what would measure the gauge, and the end is off that by what is of second
     order in a step.
     """
-    update = at.update
+    update, found = at.update, None
     for _ in range(update.iterations):
+        if found is not None:
+            at = update.linearised(found.camera, found.change[HEAD:])
         used = used & at.seen.any(axis=1)
         found = at.solved(used)
         if not np.isfinite(found.change).all() or np.abs((found.change - at.change)[3:6]).max() > np.pi:
             raise LinAlgError("a step is not finite, or turns the camera by more than half a turn")
-        if update.iterations == 1:
+        if update.iterations == 1 or _linear(found):
             return found
-        at = update.linearised(found.camera, found.change[HEAD:])
-        if _linear(found, at):
-            return found
+    assert found is not None  # there is one iteration at least
     return changed(found, linear=False)
 
 
-def _linear(found: Correction, there: Linearisation) -> bool:
+def _linear(found: Correction) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
     now, update = found.at, found.at.update
     step = (found.change - now.change)[update.numbers]
     as_seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
-    errors = there.z - now.z - (now.own @ as_seen[:, :, None])[:, :, 0]
+    errors = update.pixels_from(found.camera, found.change) - now.z - (now.own @ as_seen[:, :, None])[:, :, 0]
     errors = np.where(now.seen & found.used[:, None], errors, 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False

@@ -138,8 +138,10 @@ class FilterState:
         last = self.landmarks.last[may]
         oldest = np.argsort(last, kind="stable")[: len(may) - most + most // _AT_ONCE]
         rows = np.sort(may[oldest[last[oldest] < self.frame]])
-        if not len(rows):
-            return self
+        return self._left_by(rows) if len(rows) else self
+
+    def _left_by(self, rows: IndexArray) -> FilterState:
+        """After landmarks of some rows of the state leave the pose that others left last, or the present one."""
         s, covariance, G, here = self, self.covariance, self.landmarks.gauge[rows], self.from_camera(rows)
         own, _, by_rig = covariance.marginals(rows)
         seen = _as_seen(own, covariance.P[covariance.numbers(rows), LEAVING], covariance.P[LEAVING, LEAVING], G)

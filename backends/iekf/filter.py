@@ -26,7 +26,7 @@ import numpy as np
 
 from backends.ekf.covariance import CAMERA, POSE
 from backends.ekf.filter import LandmarkFilter
-from backends.ekf.landmarks import Coordinates
+from backends.ekf.landmarks import InverseDepth
 from slam.bounds import from_options, require_not_negative
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
@@ -117,4 +117,4 @@ class IekfBackend(LandmarkFilter):
     def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
         self.config = from_options(IekfConfig, "iekf", options)
         first = InvariantCamera(models.initial_pose, np.zeros(3), np.zeros(3))
-        super().__init__(rig, models, first, Coordinates(True), self.config.iterations, self.config.kept)
+        super().__init__(rig, models, first, InverseDepth(), self.config.iterations, self.config.kept)

@@ -13,7 +13,7 @@ from backends.ekf.backend import EkfConfig
 from backends.ekf.camera import displacement, from_body_axes, pose_by_error, predicted, prior
 from backends.ekf.covariance import CAMERA, HEAD, LEAVING, Apart, Covariance
 from backends.ekf.innovation import Update
-from backends.ekf.landmarks import COORDINATES, Coordinates, FilterLandmarks, Slide
+from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth, Slide
 from backends.ekf.motion import EulerCamera
 from backends.ekf.solve import gate, gated_correction
 from backends.ekf.state import FilterState
@@ -98,19 +98,17 @@ def covariance_of(P: np.ndarray) -> Covariance:
 # --- the landmarks' coordinates ---
 
 
-@pytest.mark.parametrize("coordinates", COORDINATES.values(), ids=COORDINATES)
+@pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
 def test_coordinates_there_and_back(coordinates):
     rng = np.random.default_rng(0)
     anchors = np.concatenate([se3.so3_exp(rng.standard_normal((5, 3))), rng.standard_normal((5, 3, 1))], axis=2)
     local = rng.uniform((-2, -2, 1), (2, 2, 60), (5, 3))
     points = (anchors[:, :, :3] @ local[:, :, None])[:, :, 0] + anchors[:, :, 3]
-    marks = FilterLandmarks.at(coordinates, np.arange(5), anchors, points, 0)
-    place = lambda change: marks.moved(coordinates, slice(None), change).points  # noqa: E731
-    np.testing.assert_allclose(place(np.zeros((5, 3))), points, atol=1e-10)
-    for i, (D, gauge) in enumerate(zip(marks.D, marks.gauge)):
-        numeric = jacobian(lambda x, i=i: place(np.tile(x, (5, 1)))[i], np.zeros(3), 1e-6 * abs(marks.c[i, 2]))
+    c = coordinates.of(anchors, points)
+    np.testing.assert_allclose(coordinates.points(anchors, c), points, atol=1e-10)
+    for i, D in enumerate(coordinates.jacobian(anchors, c)):
+        numeric = jacobian(lambda x, i=i: coordinates.points(anchors[[i]], x[None])[0], c[i], 1e-6 * abs(c[i, 2]))
         np.testing.assert_allclose(D, numeric, rtol=1e-4, atol=1e-4)
-        np.testing.assert_allclose(D @ gauge, np.hstack([np.eye(3), -se3.hat(points[i])]), atol=1e-10)
 
 
 # --- the covariance against the dense formulas ---
@@ -235,7 +233,7 @@ def in_deviations(P: np.ndarray, of: np.ndarray) -> np.ndarray:
 
 
 def test_the_prediction_is_as_printed():
-    s, _, _ = state_of(4, Coordinates(True))
+    s, _, _ = state_of(4, InverseDepth())
     camera, P, dt = s.camera.x + 0.1 * np.arange(12.0) / 12, dense(s.covariance), 0.25
     s = replace(s, camera=replace(s.camera, x=camera))
     found = s.advanced(dt, predicted(s.camera, MODELS, P[:12, :12], dt, False))
@@ -258,7 +256,7 @@ def test_a_longer_gap_leaves_the_attitude_no_better_known():
     assert np.diff(variances).min() >= 0
 
 
-@pytest.mark.parametrize("coordinates", COORDINATES.values(), ids=COORDINATES)
+@pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
 def test_the_update_is_the_joseph_form(coordinates):
     s, h, rng = state_of(12, coordinates)
     P, marks = dense(s.covariance), s.landmarks
@@ -284,7 +282,7 @@ def test_the_update_is_the_joseph_form(coordinates):
     assert solution.nis == pytest.approx(nu @ np.linalg.solve(S, nu), rel=1e-6)
 
 
-@pytest.mark.parametrize("coordinates", COORDINATES.values(), ids=COORDINATES)
+@pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
 def test_augmentation_is_the_derivative_of_triangulation(coordinates):
     s, _, _ = state_of(3, coordinates)
     h = np.array([[0.4, -0.3, 6.0]])
@@ -317,10 +315,10 @@ def far_off(iterations: int, spread: float = 0.05) -> tuple[FilterState, Update]
     z = RIG.project_stereo(se3.transform(se3.inverse(truth), points))[0] + 0.5 * rng.standard_normal((12, 3))
     off = np.tile([spread / 3, spread / 3, spread], (12, 1))
     known = points + off * rng.standard_normal((12, 3))
-    marks = FilterLandmarks.at(Coordinates(False), np.arange(12), np.zeros((12, 3, 4)), known, 0)
+    marks = FilterLandmarks.at(Euclidean(), np.arange(12), np.zeros((12, 3, 4)), known, 0)
     P = np.diag(np.concatenate([np.full(3, 1.5**2), np.full(3, 0.2**2), np.ones(6), off.ravel() ** 2]))
     s = replace(s, landmarks=marks, covariance=covariance_of(P))
-    return s, update_of(s, z, Coordinates(False), iterations, 1 - 1e-9)
+    return s, update_of(s, z, Euclidean(), iterations, 1 - 1e-9)
 
 
 def ungated(update: Update):
@@ -364,13 +362,13 @@ def far_in_depth(seed: int) -> tuple[FilterState, Update, np.ndarray]:
     truth = s.camera.moved(np.pad(sigma * rng.standard_normal(6), (0, 6))).pose
     z = RIG.project_stereo(se3.transform(se3.inverse(truth), points))[0] + 0.5 * rng.standard_normal((n, 3))
     anchors = np.tile(np.eye(3, 4), (n, 1, 1))
-    c = Coordinates(True).of(anchors, points)
+    c = InverseDepth().of(anchors, points)
     off = np.stack([np.full(n, 1e-3), np.full(n, 1e-3), 0.2 * c[:, 2]], axis=1)
-    marks = FilterLandmarks.at(Coordinates(True), np.arange(n), anchors, points, 0)
-    marks = marks.moved(Coordinates(True), slice(None), off * rng.standard_normal((n, 3)).clip(-2.5, 2.5))
+    known = InverseDepth().points(anchors, c + off * rng.standard_normal((n, 3)).clip(-2.5, 2.5))
     P = np.diag(np.concatenate([sigma**2, np.full(6, 0.01), off.ravel() ** 2]))
+    marks = FilterLandmarks.at(InverseDepth(), np.arange(n), anchors, known, 0)
     s = replace(s, landmarks=marks, covariance=covariance_of(P))
-    return s, update_of(s, z, Coordinates(True), EkfConfig().iterations, 1 - 1e-9), truth
+    return s, update_of(s, z, InverseDepth(), EkfConfig().iterations, 1 - 1e-9), truth
 
 
 def test_depths_that_move_do_not_bend_the_pose():
@@ -394,7 +392,7 @@ def test_a_coordinate_at_its_limit_has_changed_by_so_much():
     asked = np.zeros(45)
     asked[2] = -2 * s.landmarks.c[0, 2]
     at = replace(update, camera=replace(s.camera, transports=False)).linearised(None, asked)
-    made = (s.landmarks.moved(Coordinates(True), slice(None), asked.reshape(-1, 3)).c - s.landmarks.c).reshape(-1)
+    made = (InverseDepth().moved(s.landmarks.c, asked.reshape(-1, 3)) - s.landmarks.c).reshape(-1)
     assert made[2] > asked[2]
     np.testing.assert_array_equal(at.change[HEAD:], made)
     expected = (update.z - at.z + (at.own @ made.reshape(-1, 3, 1))[:, :, 0]).reshape(-1)
@@ -431,7 +429,7 @@ def test_an_update_by_some_landmarks_depends_on_no_others():
 
 
 @pytest.mark.parametrize("transports", [True, False])
-@pytest.mark.parametrize("coordinates", COORDINATES.values(), ids=COORDINATES)
+@pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
 def test_no_linearisation_measures_a_displacement_of_the_world(coordinates, transports):
     """By metres, seen from wherever, with landmarks changed by whatever: H is zero along it."""
     s, _, rng = state_of(12, coordinates)
@@ -453,7 +451,7 @@ def test_no_linearisation_measures_a_displacement_of_the_world(coordinates, tran
 # --- features that slide ---
 
 
-@pytest.mark.parametrize("coordinates", COORDINATES.values(), ids=COORDINATES)
+@pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
 def test_a_landmark_slides_across_its_line_of_sight_with_the_angle_of_view(coordinates):
     s, _, _ = state_of(4, coordinates)
     slide, rows, x = Slide(0.01, 0.0, 0.0), np.array([0, 2]), s.camera.x.copy()
@@ -474,7 +472,7 @@ def test_a_landmark_slides_across_its_line_of_sight_with_the_angle_of_view(coord
         added = dense(after.covariance) - dense(before.covariance)
         for row in range(4):
             at = slice(CAMERA + 3 * row, CAMERA + 3 * row + 3)
-            D = s.landmarks.D[row]
+            D = coordinates.jacobian(s.landmarks.anchors[row : row + 1], s.landmarks.c[row : row + 1])[0]
             across = (
                 slide.density**2 * by[row] * ((sight[row] @ sight[row]) * np.eye(3) - np.outer(sight[row], sight[row]))
             )
