@@ -26,7 +26,7 @@ from slam.window import pose_only
 from slam.window.gating import INFLATION
 from slam.window.problem import Rows
 from slam.window.solver import Solution, linearised, solve
-from slam.window.stereo import RectifiedStereo
+from slam.window.stereo import RectifiedStereo, relative_covariance
 
 FRAMES = 4  #: cost: frames of a window; older ones are marginalised
 
@@ -102,10 +102,10 @@ class BodyEstimator:
     def _followed(self, b: BodyBelief, id: int, seen: _Seen | None, cameras: RecentPoses) -> BodyBelief:
         """The belief with a further frame; LinAlgError where it cannot be solved."""
         cameras = _of(cameras, np.append(b.stamps, cameras.stamps[-1]))
-        earlier = _of(cameras, b.stamps)
         if len(b) >= FRAMES:
-            b = slid(b, self.stereo, carried(b, earlier, self.models), self.models.drift / self.stereo.f)
-            cameras, earlier = _of(cameras, cameras.stamps[1:]), _of(cameras, b.stamps)
+            motion = carried(b, _of(cameras, b.stamps), self.models)
+            b = slid(b, self.stereo, motion, self.models.drift / self.stereo.f)
+            cameras = _of(cameras, cameras.stamps[1:])
         expected = self._expected(b, cameras)
         rejected = none = np.zeros(0, np.int64)
         if seen is not None:
@@ -146,10 +146,9 @@ class BodyEstimator:
         impulses = by_step * np.sqrt(np.repeat(self.models.velocity_variance(dt)[::-1], 3))
         covariance = by_step @ back @ b.estimate.velocity_covariance @ back.T @ by_step.T
         turn = Y[:3, :3].T @ b.poses[-2][:3, :3]
-        return _Expected(
-            b, covariance + impulses @ impulses.T + _between(cameras), impulses @ impulses.T,
-            turn @ b.points.local @ turn.T,
-        )  # fmt: skip
+        way, impulse = cameras.covariance[-12:, -12:], impulses @ impulses.T
+        covariance = covariance + impulse + relative_covariance(way, cameras.poses[-2], cameras.poses[-1])
+        return _Expected(b, covariance, impulse, turn @ b.points.local @ turn.T)
 
     def _predicted(self, b: BodyBelief, cameras: RecentPoses) -> BodyBelief:
         """With the covariances of a frame in which nothing was measured."""
@@ -273,16 +272,10 @@ def _of(cameras: RecentPoses, stamps: Array) -> RecentPoses:
     at = np.searchsorted(cameras.stamps, stamps).clip(0, len(cameras) - 1)
     if len(cameras) < len(stamps) or (cameras.stamps[at] != stamps).any():
         raise np.linalg.LinAlgError("the camera's poses in a body's frames are not known")
+    if len(cameras) == len(stamps):
+        return cameras
     rows = (6 * at[:, None] + np.arange(6)).reshape(-1)
     return RecentPoses(cameras.stamps[at], cameras.poses[at], cameras.covariance[rows[:, None], rows])
-
-
-def _between(cameras: RecentPoses) -> Array:
-    """Covariance (6, 6) of the camera's newest pose given the last but one."""
-    A = adjoint(inverse(cameras.poses[-1]) @ cameras.poses[-2])
-    P = cameras.covariance[-12:, -12:]
-    cross = A @ P[:6, 6:]
-    return np.asarray(P[6:, 6:] + A @ P[:6, :6] @ A.T - cross - cross.T)
 
 
 def _velocity(before: Array, after: Array, dt: float) -> tuple[Array, Array]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam.bodies.config import CLEAR
+from slam.bodies.track_kernels import add_rows, add_weighted
 from slam.chi_square import chi_square_limit
 from slam.kernels.linear import factorise, median, solve_factorised, square
 from slam.kernels.se3 import point_by_motion
@@ -69,34 +70,10 @@ def _common_motion(sums, columns, members, out):
     for k in range(1 + _SOFT + _SHARP):
         _reweigh(off, members, k <= _SOFT, weight)
         total[:] = 0.0
-        _add_rows(total, sums, every, weight)
+        add_rows(total, sums, every, weight)
         _factorise(total, 1.0, factor)
         _solve(factor, total[21:27], out)
         _squares_against(columns, out, off)
-
-
-@disjoint_helper
-def _add_weighted(total, part, weight):
-    for k in range(28):
-        total[k] += weight * part[k]
-
-
-@helper
-def _add_rows(total, parts, rows, weight):
-    """Add the `rows` (M,) of `parts` (N, 28), each times its `weight` (N,)."""
-    n = len(rows)
-    for m in range(0, n - 3, 4):
-        a, b, c, d = rows[m], rows[m + 1], rows[m + 2], rows[m + 3]
-        _add_four(total, parts[a], parts[b], parts[c], parts[d], (weight[a], weight[b], weight[c], weight[d]))
-    for m in range(n - n % 4, n):
-        _add_weighted(total, parts[rows[m]], weight[rows[m]])
-
-
-@disjoint_helper
-def _add_four(total, a, b, c, d, weight):
-    """What is loaded and stored once serves four tracks."""
-    for k in range(28):
-        total[k] += (weight[0] * a[k] + weight[1] * b[k]) + (weight[2] * c[k] + weight[3] * d[k])
 
 
 @disjoint_helper
@@ -262,7 +239,7 @@ def _window_tests(starts, tracks, sums, columns, alone, scale, rest, asked, supp
     for m in range(n):
         if rest[m]:
             weight[m] = min(1.0, _PULL / max(alone[m], 1e-9)) / scale
-            _add_weighted(total, sums[m], weight[m])
+            add_weighted(total, sums[m], weight[m])
     factor, motion, shares = np.empty((6, 6)), np.empty(6), np.empty(21)
     inside, outside, column, unit = np.empty(28), np.empty(21), np.empty(6), np.zeros(6)
     gradient, whole, lower, scaled = np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 7))
@@ -293,7 +270,7 @@ def _window_tests(starts, tracks, sums, columns, alone, scale, rest, asked, supp
         if size < support or size > largest or most <= asked[size] * (1.0 - share):
             continue
         inside[:] = 0.0
-        _add_rows(inside, sums, own, weight)
+        add_rows(inside, sums, own, weight)
         _unfold(inside, 0.0, whole)
         for i in range(6):
             gradient[i] = PRIOR[i] * motion[i] - inside[21 + i]
@@ -418,6 +395,6 @@ def groups_apart(sums, place, codes, sizes, asked, support):
     total, information = np.zeros(28), np.empty((6, 6))
     for m in range(n):
         if rest[m]:
-            _add_weighted(total, sums[m], 1.0)
+            add_weighted(total, sums[m], 1.0)
     _unfold(total, 1.0, information)
     return group, values[:groups].copy(), alone, common, information, scale

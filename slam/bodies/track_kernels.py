@@ -12,7 +12,7 @@ import numpy as np
 from slam.kernels.linear import invert_symmetric, multiply, row_times, square, trace, turn
 from slam.kernels.se3 import transform, transform_back
 from slam.kernels.stereo import by_point, residual
-from slam.runtime.compilation import helper, kernel
+from slam.runtime.compilation import disjoint_helper, helper, kernel
 
 RIDGE = 1e-9  #: numerics: share of the trace, for information over a whole window,
 PART = 1e-6  #: numerics: for a part of it
@@ -39,6 +39,31 @@ def inverses(M, share, least):
     for n in range(len(M)):
         invert_symmetric(M[n], share * trace(M[n]) + least, out[n])
     return out
+
+
+@disjoint_helper
+def add_weighted(total, part, weight):
+    """Add a track's sums (28,), see `slam.bodies.scene_kernels`, times a weight."""
+    for k in range(28):
+        total[k] += weight * part[k]
+
+
+@helper
+def add_rows(total, parts, rows, weight):
+    """Add the `rows` (M,) of `parts` (N, 28), each times its `weight` (N,)."""
+    n = len(rows)
+    for m in range(0, n - 3, 4):
+        a, b, c, d = rows[m], rows[m + 1], rows[m + 2], rows[m + 3]
+        _add_four(total, parts[a], parts[b], parts[c], parts[d], (weight[a], weight[b], weight[c], weight[d]))
+    for m in range(n - n % 4, n):
+        add_weighted(total, parts[rows[m]], weight[rows[m]])
+
+
+@disjoint_helper
+def _add_four(total, a, b, c, d, weight):
+    """What is loaded and stored once serves four tracks."""
+    for k in range(28):
+        total[k] += (weight[0] * a[k] + weight[1] * b[k]) + (weight[2] * c[k] + weight[3] * d[k])
 
 
 # ---------------------------------------------------------------------------------------------- windows of tracks

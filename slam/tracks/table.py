@@ -212,7 +212,8 @@ class Tracks(LandmarkTable):
 
     def count(self, rows: IndexArray) -> IdArray:
         """Number of measurements of tracks in the window (M,)."""
-        return np.asarray(np.count_nonzero(self.dof[rows], axis=1))
+        measured = self.dof.take(rows, axis=0) != 0
+        return np.asarray(measured @ np.ones(measured.shape[1], np.int64))  # `count_nonzero` takes twice the time
 
     def set_features(self, rows: IndexArray, features: IndexArray) -> None:
         """Rows (K,) are found as these features, in place; of rows alike to the bit, the first has the feature."""
