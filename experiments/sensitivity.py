@@ -55,6 +55,7 @@ _PERTURBATIONS = 6  # runs of the default with noise, for the scatter
 _PIXEL_NOISE = 0.05  # [px]
 _LOST = 20.0  # times the error of the default: the run has lost its way
 _PATIENCE = 10  # times the processor time of the default, after which a run counts as failed
+_LONGEST = 3600  # seconds after which a run that computes nothing counts as failed, on whatever machine
 _UNCOVERED = 0.5  # share of the default's frames with a body below which bodies count as lost
 _FAILED = {"camera": "fails", "bodies": "fails"}
 
@@ -109,7 +110,11 @@ def measure(tree: Path, folder: Path, seed: int, cases: list[str], patience: int
     """What `errors` finds in a copy of the program; None where it fails or needs more seconds of processor time."""
     call = [sys.executable, tree / "experiments" / "sensitivity.py", "--errors", folder, str(seed), *cases]
     limit = None if patience is None else lambda: resource.setrlimit(resource.RLIMIT_CPU, (patience, patience))
-    done = subprocess.run(call, capture_output=True, text=True, preexec_fn=limit)
+    try:
+        done = subprocess.run(call, capture_output=True, text=True, preexec_fn=limit, timeout=_LONGEST)
+    except subprocess.TimeoutExpired:
+        print(f"failed: nothing after {_LONGEST} s", file=sys.stderr)
+        return None
     if done.returncode != 0:
         print("failed:", (done.stderr.splitlines() or [done.returncode])[-1], file=sys.stderr)
         return None

@@ -17,7 +17,6 @@ from slam.geometry.se3 import Array, hat
 from slam.models import ANYWHERE, EstimatorModels
 
 _ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an attitude [rad]
-_ANY_TURN = np.pi / np.sqrt(3)  # that of a turn by any angle [rad]
 
 _AT_REST = np.diag(np.repeat([1.0, 0.0], POSE))  # of a camera's error (12,)
 
@@ -112,7 +111,7 @@ def predicted(camera: Camera, models: EstimatorModels, P: Array, dt: float, rest
     if rests:
         return camera.stopped(), _AT_REST, np.zeros_like(P)
     if _any_attitude(models, P, dt):
-        pose = min(models.initial_velocity_sigma * dt, ANYWHERE), _ANY_TURN
+        pose = min(models.initial_velocity_sigma * dt, ANYWHERE), np.pi / np.sqrt(3)
         return camera.stopped(), _AT_REST, from_body_axes(camera, prior(models, pose))
     camera, A, W = camera.advanced(dt)
     return camera, A, (W * np.repeat(models.motion.velocity_variance(dt), 3)) @ W.T
@@ -126,7 +125,7 @@ def prior(models: EstimatorModels, pose: tuple[float, float] | None = None) -> A
 
 
 def _any_attitude(models: EstimatorModels, P: Array, dt: float) -> bool:
-    """Whether a camera, by its error's covariance P (12, 12), may have turned anyhow in the last `dt` [s] or before."""
+    """Whether a camera with the error's covariance P (12, 12) may have turned anyhow in the last `dt` [s]."""
     attitude, rate = np.arange(3, 6), np.arange(9, 12)
-    turned = 2 * dt * P[attitude, rate] + dt * dt * (P[rate, rate] + models.motion.velocity_variance(dt)[1])
-    return bool(turned.max() > _ANY_TURN**2 or (P[attitude, attitude] + turned).max() > _ANY_ATTITUDE**2)
+    variance = P[attitude, attitude] + 2 * dt * P[attitude, rate] + dt * dt * P[rate, rate]
+    return bool(variance.max() + dt * dt * models.motion.velocity_variance(dt)[1] > _ANY_ATTITUDE**2)

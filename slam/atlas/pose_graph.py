@@ -243,9 +243,7 @@ class _Motions:
     def optimised(self, poses: Array, common: Array) -> tuple[Array, Array, _Normal]:
         """Poses (M, 4, 4) and common errors (m,) that minimise χ², and normal equations near there."""
         cost = self.cost(poses, common)
-        for _ in range(
-            30
-        ):  # of most graphs one to nine steps; a bound for those whose steps are halved again and again
+        for _ in range(30):  # most graphs need one to nine; the bound is for steps that are halved again and again
             normal = self.normal(poses)
             step, change = normal.step(self.residuals(poses, common), common)
             for half in 0.5 ** np.arange(8):  # of a step that increases χ²

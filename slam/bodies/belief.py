@@ -48,6 +48,7 @@ def when_missed(probability: float, seen: int, age: int) -> float:
 
 
 _EXACT = 1e-12 * np.eye(6)  # numerics: [rad², m²]
+_TURN = 0.01  # cost: a point is seen from elsewhere by no less [rad]; what is less adds up
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,7 @@ class Points(Table):
     failures: IdArray  # how often running each was rejected (N,)
     unseen: IdArray  # frames since each was seen (N,)
     first: Array  # direction (N, 3) from which each was seen first, in body coordinates
-    turned: Array  # largest angle between that and later ones (N,) [rad] that the prior allows for
+    turned: Array  # largest angle between that and later ones (N,) [rad], as far as it is allowed for
 
     @classmethod
     def new(cls, ids: IdArray, position: Array, local: Array, eye: Array) -> Points:
@@ -172,17 +173,19 @@ def _drifted(prior: RelativePrior, b: BodyBelief, density: float) -> tuple[Relat
     A feature is found where the image looks like it; seen from farther round than ever before, that is elsewhere on the
     body. The first two coordinates of a point in its chart are its direction.
     """
-    p, of = b.points, prior.points
-    if not density:
+    p = b.points
+    cosine = np.einsum("ni,ni->n", p.first, _directions(p.position, b.poses[-1][:3, 3]))
+    turned = np.maximum(p.turned, np.arccos(np.clip(cosine, -1, 1)))
+    more = (turned - p.turned)[prior.points]
+    far = np.flatnonzero(more > _TURN)
+    if not len(far) or not density:
         return prior, p.turned
-    cosine = np.einsum("ni,ni->n", p.first[of], _directions(p.position[of], b.poses[-1][:3, 3]))
-    more = np.maximum(np.arccos(np.clip(cosine, -1, 1)) - p.turned[of], 0.0)
-    turned, far = p.turned.copy(), np.flatnonzero(more)
-    turned[of] += more
+    out = p.turned.copy()
+    out[prior.points[far]] = turned[prior.points[far]]
     at = (3 * far[:, None] + np.arange(2)).reshape(-1)
     S = np.diag(1.0 / np.repeat(density**2 * more[far], 2)) + prior.information[np.ix_(at, at)]
     gain = np.linalg.solve(S, prior.information[at]).T
     information = prior.information - gain @ prior.information[at]
     return changed(
         prior, information=0.5 * (information + information.T), vector=prior.vector - gain @ prior.vector[at]
-    ), turned
+    ), out

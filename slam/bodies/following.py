@@ -11,7 +11,7 @@ from slam.bodies.bodies import Body, of_bodies
 from slam.bodies.config import MIN_FRAMES, MIN_POINTS
 from slam.bodies.estimator import BodyEstimator
 from slam.bodies.frame import Frame
-from slam.bodies.track_kernels import LEAST, expected_pixels, inverses
+from slam.bodies.track_kernels import expected_pixels, inverses
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among, isin
@@ -26,6 +26,7 @@ from slam.window.gating import MIN_CONSENSUS
 
 _SEARCH = 4.0, 25.0  # least and largest half size of the search windows of tracks [px]
 _ALIKE = 0.5, 0.8  # largest descriptor distance, and its largest ratio to the second best
+_UNKNOWN = 1e-6  # numerics: on a member's point that has no information yet [1/m²]
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
 _RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
 
@@ -61,7 +62,7 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: IndexArray, dt: 
     for body in bodies.values():
         mine = np.flatnonzero(tracks.body == body.id)
         R, J = body.T[:3, :3], points_by_pose(tracks.local[mine])
-        own = inverses(tracks.local_information[mine], 0.0, LEAST)
+        own = inverses(tracks.local_information[mine], 0.0, _UNKNOWN)
         spread = own + J @ body.covariance @ np.swapaxes(J, 1, 2)
         tracks.position[mine], tracks.covariance[mine] = transform(body.T, tracks.local[mine]), R @ spread @ R.T
 

@@ -27,6 +27,7 @@ MARGIN = 0.25  # how far from a body's extent its further features may lie, as a
 _ROUNDS = 3  # numerics: of fitting poses and points in turn
 _OFF = 0.2  # how far a pose may be from a constant velocity, before anything is known [rad] and [m]
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join
+_DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
 _LOOSE = 4.0  # times the 99 % limit that the χ² of a member may be whose motion is explained for the most part
 
 
@@ -252,7 +253,7 @@ def merge(bodies: dict[int, Body], tracks: Tracks) -> None:
             continue
         for other in [b for b in bodies.values() if b.id < id and b.measured and b.id not in body.distinct]:
             apart = _apart(body, mine, other, _members(tracks, other.id), tracks)
-            if apart > 1.0:
+            if apart > _DISTINCT:
                 body = changed(body, distinct=body.distinct | {other.id})
             elif apart < 1.0 and whole is None:
                 whole = other

@@ -107,8 +107,8 @@ def with_frame(
 
 
 def _evidence(chance: float) -> float:
-    """−log10 of a chance, no more than is asked for at most."""
-    return -float(np.log10(max(chance, 10.0**-_SLIDES)))
+    """−log10 of a chance, up to twice what is asked for at most."""
+    return -float(np.log10(max(chance, 10.0 ** (-2.0 * _SLIDES))))
 
 
 def _by_members(moved: Displacements, scene: Scene, by_rig: Array) -> tuple[float, float]:

@@ -71,14 +71,19 @@ class Evidence(NamedTuple):
         """The same with further errors: of the parameters, and by residual fields, which are then marginalised.
 
         The estimate ``S⁻¹ e`` gets the covariance ``S⁻¹ + V + φ S⁻¹ C Cᵀ S⁻¹``, with V the `variance` (n,) of the
-        parameters and φ that of each coefficient of the fields, so the information is ``S (S + S V S + φ C Cᵀ)⁻¹ S``,
-        which needs no inverse of S.
+        parameters and φ that of each coefficient of the fields. The information is ``S₁ = G S`` with
+        ``G = (1 + S V)⁻¹``, and then ``S₁ (S₁ + φ C₁ C₁ᵀ)⁻¹ S₁`` with ``C₁ = G C``: no inverse of S, nor of its square.
         """
-        total = self.S + (self.S * variance) @ self.S + fields * self.cross @ self.cross.T
+        gain = np.linalg.inv(np.eye(len(self.S)) + self.S * variance)
+        S, e, cross = gain @ self.S, gain @ self.e, gain @ self.cross
+        S = 0.5 * (S + S.T)
+        if not fields:
+            return Evidence(S, e, cross)
+        total = S + fields * cross @ cross.T
         # 1e-12: numerics, of what nothing shows
-        total[np.diag_indices(len(total))] += 1e-12 * np.diag(self.S) + np.finfo(float).tiny
-        gain = np.linalg.solve(0.5 * (total + total.T), self.S).T
-        return Evidence(gain @ self.S, gain @ self.e, (0.0 if fields else 1.0) * gain @ self.cross)
+        total[np.diag_indices(len(total))] += 1e-12 * np.diag(S) + np.finfo(float).tiny
+        gain = np.linalg.solve(total, S).T
+        return Evidence(gain @ S, gain @ e, 0.0 * cross)
 
     def __add__(self, other: Evidence) -> Evidence:  # type: ignore[override]
         """The product of both likelihoods."""

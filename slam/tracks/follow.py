@@ -181,10 +181,7 @@ def _near(looks, signs, feature_looks, feature_signs, places, variances, points,
         first = second = far
         own = metres + sigmas * np.sqrt(variances[n])
         for c in range(size):
-            m, largest = (
-                candidates[c],
-                own + sigmas * deviation[c],
-            )  # at most: roots add up to more
+            m, largest = candidates[c], own + sigmas * deviation[c]  # at most: roots add up to more
             x, y, z = points[m, 0] - places[n, 0], points[m, 1] - places[n, 1], points[m, 2] - places[n, 2]
             square = x * x + y * y + z * z
             if not square < largest * largest or feature_signs[m] != signs[n]:

@@ -246,16 +246,6 @@ def test_the_prediction_is_as_printed():
     assert_equal_to_rounding(in_deviations(dense(found.covariance), expected), in_deviations(expected, expected))
 
 
-def test_a_longer_gap_leaves_the_attitude_no_better_known():
-    """Also where the camera may have turned by any angle, of which the variance is bounded."""
-    camera = EulerCamera.first(MODELS, True)
-    P, variances = from_body_axes(camera, prior(MODELS)), []
-    for dt in np.geomspace(0.01, 1e6, 200):
-        _, A, noise = predicted(camera, MODELS, P, dt, False)
-        variances.append(np.trace((A @ P @ A.T + noise)[3:6, 3:6]))
-    assert np.diff(variances).min() >= 0
-
-
 @pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
 def test_the_update_is_the_joseph_form(coordinates):
     s, h, rng = state_of(12, coordinates)

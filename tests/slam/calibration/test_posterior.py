@@ -95,6 +95,14 @@ def test_what_errors_of_parameters_and_fields_leave():
     assert not nothing.S.any() and not nothing.e.any()
 
 
+def test_directions_of_which_next_to_nothing_is_known_spoil_no_others():
+    """Of information from 1 to 1e12: its square, which has no digits left for the least, is not formed."""
+    rng, known, V = np.random.default_rng(0), np.logspace(0, 12, 13), 1e-7
+    Q = np.linalg.qr(rng.standard_normal((13, 13)))[0]
+    left = Evidence((Q * known) @ Q.T, np.zeros(13), np.zeros((13, 1))).with_error(np.full(13, V))
+    np.testing.assert_allclose(np.diag(Q.T @ left.S @ Q), known / (1.0 + V * known), rtol=1e-2)
+
+
 def test_rows_weigh_the_inverse_of_their_variance_and_outliers_next_to_nothing():
     model, rng = RigModel(CAR), np.random.default_rng(3)
     points = model.focal * rng.uniform([-0.7, -0.2, 0.01], [0.7, 0.2, 0.05], (2000, 3))
