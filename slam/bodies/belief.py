@@ -2,7 +2,8 @@
 
 How sure it is that a body exists follows from the frames in which it was measured and those in which it was not: the
 recursion of integrated probabilistic data association (Mušicki, Evans and Stanković, IEEE Transactions on Automatic
-Control 39, 1994). Whether it moves is another question, see `slam.bodies.proof`.
+Control 39, 1994). A measurement counts the more, the better the body's motion explains its points compared with a still
+world.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from slam.window.problem import Motion, RelativePrior, Rows, Window
 from slam.window.stereo import RectifiedStereo
 
 EVEN = 0.5  #: fixed: a body rather exists than not above this probability, which it has before its first evidence
+_LEAST = 2.0  # ratio of the likelihoods of a measured body, at least: a body at rest shows no motion, but is there
 _CERTAIN = 1.0 - 1e-9  # a probability of 1 could never fall again
 
 
@@ -35,9 +37,12 @@ def compact(points: Array) -> BoolArray:
     return np.asarray(distance <= _FAR * np.median(distance) if len(points) else np.zeros(0, bool))
 
 
-def when_measured(probability: float) -> float:
-    """The probability after a frame that measured the body: it is clear then that there is something."""
-    ratio = math.exp(0.5 * CLEAR)
+def when_measured(probability: float, gain: float) -> float:
+    """The probability after a frame that measured the body, which explains a member better than the world by `gain`.
+
+    No gain counts for more than is clear: many members share one error of the camera's pose.
+    """
+    ratio = max(_LEAST, math.exp(0.5 * min(gain, CLEAR)))
     return min(_CERTAIN, probability * ratio / (1.0 - probability + probability * ratio))
 
 

@@ -20,7 +20,8 @@ from slam.models import ObjectModels
 from slam.object_data import MovingObject
 from slam.tracks.table import Tracks
 
-UNMEASURED_SHARE = 0.05  #: most frames in which it is reported so, as a share of those in which it was measured
+_UNMEASURED = 1.0  # [s] for which a body is still reported after its last measurement
+UNMEASURED_SHARE = 0.05  #: most frames in which it is so, as a share of those in which it was measured
 PROOF = 4  #: by frames that are certain by both tests, each of which counts twice, or by way and turn together
 SOLID = 0.6  #: share of the points inside a body that go with it: where others stand still, a shadow or leaves move
 CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
@@ -194,11 +195,12 @@ def hidden(bodies: Iterable[Body], eye: Array, points: Array) -> BoolArray:
     return behind
 
 
-def with_evidence(body: Body, agreeing: int, against: int) -> Body:
+def with_evidence(body: Body, gain: float, agreeing: int, against: int) -> Body:
     """The body after what this frame says of its existence, see `slam.bodies.belief`, and of what it encloses."""
-    p = body.existence
-    p = when_measured(p) if body.measured else when_missed(p, body.seen, body.age)
-    return changed(body, existence=p, agreeing=body.agreeing + agreeing, against=body.against + against)
+    body = changed(body, agreeing=body.agreeing + agreeing, against=body.against + against)
+    if body.measured:
+        return changed(body, existence=when_measured(body.existence, gain))
+    return changed(body, existence=when_missed(body.existence, body.seen, body.age))
 
 
 def with_extent(body: Body, local: Array) -> Body:
@@ -237,9 +239,12 @@ def reported(bodies: Mapping[int, Body], tracks: Tracks, slot: int) -> tuple[Mov
     """The bodies that are worth reporting, by ascending id: if not measured, for a short while if they likely exist."""
     out = []
     for _, body in sorted(bodies.items()):
-        b, likely = body.belief, body.missed <= UNMEASURED_SHARE * body.seen and body.existence > EVEN
-        if b is not None and body.proven and (b.estimate.measured or likely):
-            out.append(_report(body, b, tracks, slot))
+        if body.belief is None or not body.proven:
+            continue
+        e = body.belief.estimate
+        short = e.stamp - body.seen_at <= _UNMEASURED and body.missed <= UNMEASURED_SHARE * body.seen
+        if e.measured or (short and body.existence > EVEN):
+            out.append(_report(body, body.belief, tracks, slot))
     return tuple(out)
 
 

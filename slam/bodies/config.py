@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from slam.bounds import require_not_negative
 from slam.errors import ConfigurationError
 from slam.geometry.rig import MINIMAL_POINTS
@@ -16,9 +14,6 @@ MIN_POINTS = MINIMAL_POINTS + 1  #: points of a new body, as three have some pos
 MIN_FRAMES = 4  #: measurements from which on a feature is classified
 CLEAR = 6.0  #: χ² by which a track says for certain with which of two motions it goes: 20 to 1
 EXPLAINED = 0.2  #: share of the χ² of "still" that a motion, itself uncertain, may leave of what moves with it
-#: of windows in which bodies are looked for: x/z, y/z, logarithm of the depth
-SIZES = np.array([[0.1, 0.1, 0.2], [0.2, 0.2, 0.4], [0.4, 0.4, 0.8]])
-# 0.1: from 0.25 on a box that starts carries the camera along
 RUN = 3  #: frames in a row that are no chance: of a common motion, without a match, of a point that disagrees
 
 

@@ -222,7 +222,7 @@ class MovingObjectDetector(ObjectDetector):
         for id, body in list(self.bodies.items()):
             gains, against = said.get(id, (np.zeros(0), 0))
             typical = median(gains) if len(gains) else 0.0
-            body = self.bodies[id] = with_evidence(body, int((gains > CLEAR).sum()), against)
+            body = self.bodies[id] = with_evidence(body, typical, int((gains > CLEAR).sum()), against)
             if id in said and typical <= 0 and not body.proven:
                 self._drop(tracks, body)
             elif id in said:

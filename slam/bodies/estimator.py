@@ -29,6 +29,7 @@ from slam.window.solver import Solution, linearised, solve
 from slam.window.stereo import RectifiedStereo, relative_covariance
 
 FRAMES = 4  #: cost: frames of a window; older ones are marginalised
+_LEAST = 2  # points that must agree with a body that has more: one agrees with some pose always
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,8 +175,7 @@ class BodyEstimator:
         )  # fmt: skip
         motion = carried(b, cameras, self.models)
         limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.gate)
-        # one point agrees with some pose always
-        enough = max(seen.least, min(MINIMAL_POINTS - 1, (int(b.alive.sum()) + 1) // 2))
+        enough = max(seen.least, min(_LEAST, (int(b.alive.sum()) + 1) // 2))
         while True:  # without those that disagree with the others
             if used.sum() < enough:
                 return None, ids[:0], ids

@@ -27,7 +27,7 @@ from slam.bodies import membership
 from slam.bodies import scene_kernels as kernels
 from slam.bodies.belief import compact
 from slam.bodies.bodies import Body, in_body_axes, new_body
-from slam.bodies.config import MIN_FRAMES, MIN_POINTS, RUN, SIZES, WINDOW
+from slam.bodies.config import MIN_FRAMES, MIN_POINTS, RUN, WINDOW
 from slam.bodies.fits import constant_velocity, fit_velocities, measure, times_vectors
 from slam.bodies.frame import Frame, Setup
 from slam.bodies.regions import Region
@@ -43,6 +43,8 @@ _RECENT = 5  # frames that are recent, at most; of short tracks the later half
 FARTHEST = 4.0  #: a track's depth must be so many times its deviation
 _TAIL = 3.0  # tracks; see `limit`
 _UPPER_QUARTILE = chi_square_limit(3, 0.75)  # of χ²(3)
+_SIZES = np.array([[0.1, 0.1, 0.2], [0.2, 0.2, 0.4], [0.4, 0.4, 0.8]])  # of windows: x/z, y/z, logarithm of the depth
+# 0.1: from 0.25 on a box that starts carries the camera along
 _PRECISE = 0.1  # times the noise of a pixel: what it is from frame to frame at least, without what lasts
 
 
@@ -140,8 +142,8 @@ def classify_scene(moved: Displacements, place: Array, test: float, least: int =
         return Scene([], np.zeros(n), np.zeros(6), np.diag(1.0 / kernels.PRIOR))
     sums = kernels.normal_equations(moved.points, moved.d, moved.W, moved.lag)
     asked = limit(test, np.arange(n + 1, dtype=np.intp))
-    codes = np.sort(kernels.window_codes(place, SIZES), axis=1)
-    group, values, alone, common, information, scale = kernels.groups_apart(sums, place, codes, SIZES, asked, least)
+    codes = np.sort(kernels.window_codes(place, _SIZES), axis=1)
+    group, values, alone, common, information, scale = kernels.groups_apart(sums, place, codes, _SIZES, asked, least)
     heavier = tail(alone[group < 0])  # of what is in no group: before, other groups would be part of it
     groups = [
         Group(np.flatnonzero(group == k), value / heavier, moved, common) for k, value in enumerate(values.tolist())

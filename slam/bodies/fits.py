@@ -16,6 +16,8 @@ from slam.geometry.se3 import Array
 from slam.tracks.table import Tracks
 
 _TOO_FAR = 3.0  # expected points so far off that linearising there is worse than at the measured point [px]
+_STEPS = 4  # numerics: of Gauss-Newton at most
+_ROUNDED = 1e-6  # numerics: disparity [px] up to which rounding decides what it is
 MOVES = 12.0  #: derived: χ²(3) at 99.3 % of the velocity, from which it counts
 AGREES = 11.3  #: derived: χ²(3) at 99 %, of places or velocities that are the same
 
@@ -27,7 +29,7 @@ def measure(rig: StereoRig, T_world_left: Array, points: Array, measured: Array,
     is met exactly, and the depth is linear in the disparity and therefore free of bias; only where the expected point
     is far off, at the measured depth. Rows whose uR is NaN have no information along the ray; unusable rows none.
     """
-    found: tuple = points_on_rays(rig.rectified_parameters, T_world_left, points, measured, sigma, _TOO_FAR)
+    found: tuple = points_on_rays(rig.rectified_parameters, T_world_left, points, measured, sigma, _TOO_FAR, _STEPS)
     return found
 
 
@@ -105,9 +107,9 @@ def _shifts(points: Array, T_world_left: Array, rig: StereoRig, correct: Callabl
     R = T_world_left[:, :3, :3]
     z, J = rig.project_stereo(times_vectors(np.swapaxes(R, 1, 2), points - T_world_left[:, :3, 3]))
     disparity = z[:, 0] - z[:, 2]
-    good = np.flatnonzero(rig.left.in_image(z[:, :2]) & (disparity > 0) & (disparity < rig.width))
+    good = np.flatnonzero(rig.left.in_image(z[:, :2]) & (disparity > _ROUNDED) & (disparity < rig.width))
     change = correct(z[good]) - z[good]
-    known = np.abs(change[:, 0] - change[:, 2]) < disparity[good]  # else it may be behind the camera then; not NaN
+    known = np.isfinite(change).all(axis=1)
     good, change, shifts = good[known], change[known], np.zeros_like(points)
     shifts[good] = times_vectors(R[good], np.linalg.solve(J[good], change[..., None])[..., 0])
     return shifts

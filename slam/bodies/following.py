@@ -21,13 +21,14 @@ from slam.object_data import ObjectObservations
 from slam.tracks import follow as features_of_tracks
 from slam.tracks.follow import match_everywhere
 from slam.tracks.table import Tracks
-from slam.window.consensus import HYPOTHESES, find_consensus
+from slam.window.consensus import find_consensus
 from slam.window.gating import MIN_CONSENSUS
 
 _SEARCH = 4.0, 25.0  # least and largest half size of the search windows of tracks [px]
 _ALIKE = 0.5, 0.8  # largest descriptor distance, and its largest ratio to the second best
 _UNKNOWN = 1e-6  # numerics: on a member's point that has no information yet [1/m²]
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
+_POSES = 200  # cost: poses of a body that are tried where its place is not known
 _RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
 
 
@@ -140,7 +141,7 @@ def found_again(body: Body, tracks: Tracks, frame: Frame) -> Array | None:
     matches = match_everywhere(tracks.look[mine], tracks.laplacian[mine], f.select(free), *_ALIKE)
     rows, seen = mine[matches.tracks], free[matches.features]
     z, guess = measurement_rows(f.uv_left[seen], f.uv_right[seen]), inverse(body.T) @ frame.T_world_left
-    found = find_consensus(s.rig, tracks.local[rows], z, guess, SIGMAS * s.sigma, HYPOTHESES, 0)
+    found = find_consensus(s.rig, tracks.local[rows], z, guess, SIGMAS * s.sigma, _POSES, 0)
     if found.inliers.sum() < max(MIN_CONSENSUS, (len(rows) + 1) // 2):
         return None
     T, middle = frame.T_world_left @ inverse(found.T_world_left), tracks.local[rows[found.inliers]].mean(axis=0)

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from slam.bodies.config import SIZES, ObjectsConfig
+from slam.bodies.config import ObjectsConfig
 from slam.data import IdArray, IndexArray, RecentPoses, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.models import ObjectModels
+
+_SHARE = 0.05  # of the depth, as the radius of what may be a body where bodies have no least size
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +36,8 @@ class Setup:
         return depth**2 * self.sigma / (self.rig.left.fu * self.rig.baseline)
 
     def radius(self, depth: Any) -> Any:
-        """Radius [m] of the region that a body may fill: half its least size, or half the least window at its depth."""
-        return 0.5 * np.maximum(self.config.size, SIZES[0, 0] * depth)
+        """Radius [m] of the region that a body may fill: half its least size, or a share of its depth."""
+        return np.maximum(0.5 * self.config.size, _SHARE * depth)
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,8 +27,8 @@ MARGIN = 0.25  # how far from a body's extent its further features may lie, as a
 _ROUNDS = 3  # numerics: of fitting poses and points in turn
 _OFF = 0.2  # how far a pose may be from a constant velocity, before anything is known [rad] and [m]
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join
-_DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
 _LOOSE = 4.0  # times the 99 % limit that the χ² of a member may be whose motion is explained for the most part
+_DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
 
 
 def membership_test(body: Body, tracks: Tracks, rows: IndexArray) -> tuple[Array, BoolArray, IndexArray]:

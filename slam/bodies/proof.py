@@ -22,12 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
-from slam.bodies.bodies import PROOF, Body
+from slam.bodies.bodies import Body
 from slam.bodies.config import MIN_POINTS
 from slam.bodies.finder import Displacements, Scene
 from slam.bodies.frame import Frame
 from slam.bodies.scene_kernels import MEDIAN, PRIOR
-from slam.bodies.track_kernels import LEAST
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, inverse, points_by_pose
 
@@ -35,6 +34,9 @@ PROVEN = 12.0  #: −log10 of the chance from which a frame proves that a body m
 _SLIDES = 20.0  # the same elsewhere: what slides with the camera was seen to agree by up to 1e-16
 _FARTHER = 2.0  # times the camera's way; from 2 to 4 nothing changes, at 1 what slides in EuRoC MH_01 is a body
 _BOTH = 0.75  # share of measurements that both cameras make: of bodies 0.93, with wrong matches 0.5
+_ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
+_MOST = 40.0  # numerics: of the evidence of a frame
+_WEAK = 1e-9  # numerics: of variance [m²]
 _ENDS = 0.5 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])  # of a body, from its middle, in its sides
 
 
@@ -80,7 +82,7 @@ class Way:
         What is seen at a wrong depth z instead of Z seems to go the share 1 − z/Z of the camera's way, as evenly.
         """
         camera = (self.cameras - self.cameras.mean(axis=0))[:, None]
-        share = (self.places[:, :1] * camera).sum() / max(float((camera**2).sum()), LEAST)
+        share = (self.places[:, :1] * camera).sum() / max(float((camera**2).sum()), _WEAK)
         return np.asarray(self.places - np.clip(share, 0.0, 1.0) * camera)
 
 
@@ -89,10 +91,9 @@ def with_frame(
 ) -> tuple[float, int]:  # fmt: skip
     """The evidence that a body moves still, after one more frame, and what this frame counts for its `PROOF`.
 
-    The evidence is a cumulative sum of −log10 of the chance that the weaker test gives, each less what that is for a
-    frame that counts one; it fades while a body rests. For a body that was followed `far`, for farther than it is wide,
-    its way alone counts, if it goes one in the camera's axes as well. Both cameras made the share `both` of the
-    members' measurements.
+    The evidence is a cumulative sum of −log10 of the chance that the weaker test gives; it fades while a body rests.
+    For a body that was followed `far`, for farther than it is wide, its way alone counts, if it goes one in the
+    camera's axes as well. Both cameras made the share `both` of the members' measurements.
     """
     says, turns, bar = _by_frames(way.places if far else way.beside_camera(), way.times), 0.0, way.bar
     if both < _BOTH or (far and _by_frames(way.in_view, way.times) < PROVEN):
@@ -103,12 +104,12 @@ def with_frame(
         by_members, turns = _by_members(moved, scene, way.by_rig)
         says = min(says, by_members)
     counts = 0 if says < max(0.5 * PROVEN, bar - turns) else 2 if says >= PROVEN else 1
-    return max(0.0, evidence + says - PROVEN / PROOF), counts
+    return max(0.0, evidence + says - _ALLOWANCE), counts
 
 
 def _evidence(chance: float) -> float:
-    """−log10 of a chance, up to twice what is asked for at most."""
-    return -float(np.log10(max(chance, 10.0 ** (-2.0 * _SLIDES))))
+    """−log10 of a chance."""
+    return -float(np.log10(max(chance, 10.0**-_MOST)))
 
 
 def _by_members(moved: Displacements, scene: Scene, by_rig: Array) -> tuple[float, float]:
@@ -137,5 +138,5 @@ def _by_frames(places: Array, times: Array) -> float:
     offset = places - places.mean(axis=0)
     squares = np.array([(offset[:, :k] ** 2).sum() for k in (1, len(_ENDS))])  # of the middle, and of all
     ways = [((basis[:, 1:].T @ offset[:, :k].reshape(n, -1)) ** 2).sum() for k in (1, len(_ENDS))]
-    ratio = np.max(ways / (np.maximum(squares - ways, 0.0) + LEAST))
+    ratio = np.max(ways / (np.maximum(squares - ways, 0.0) + _WEAK))
     return _evidence(2.0 * float(fdtrc(6, 3 * n - 9, ratio * (3 * n - 9) / 6.0)))

@@ -284,28 +284,28 @@ def expected_pixels(camera, T_world_left, position, covariance, rows, sigma):
 
 
 @kernel
-def points_on_rays(camera, T_world_left, points, measured, sigma, far):
+def points_on_rays(camera, T_world_left, points, measured, sigma, far, steps):
     """Points (N, 3) on the measured rays, their information (N, 3, 3), and numbers measured (N,).
 
-    See `slam.bodies.fits.measure`; `camera` (7,) is `slam.geometry.rig.StereoRig.rectified_parameters`, and `far`
-    [px] how far off an expected point may be.
+    See `slam.bodies.fits.measure`; `camera` (7,) is `slam.geometry.rig.StereoRig.rectified_parameters`, `far`
+    [px] how far off an expected point may be, and `steps` how often it is linearised at most.
     """
-    fu, fv, u0, v0, right_fu, right_u0, shift = camera
+    fu, fv, u0, v0, right_fu, _, shift = camera
     out, A, dof = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3)), np.zeros(len(points), np.int8)
     place, r, J, g = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
     for n in range(len(points)):
         x, y = (measured[n, 0] - u0) / fu, (measured[n, 1] - v0) / fv
         transform_back(T_world_left, points[n], place)
-        depth, stereo = place[2], not np.isnan(measured[n, 2])
-        place[0], place[1] = x * depth, y * depth
-        front = residual(camera, place, measured[n], r, J) and r[0] + r[1] == r[0] + r[1]
-        if front and stereo and abs(r[2]) > far:
-            depth = right_fu * shift / (measured[n, 2] - right_u0 - right_fu * x)  # as is measured
+        met, stereo, front = place[2], not np.isnan(measured[n, 2]), False
+        for _ in range(steps):
+            depth = met
             place[0], place[1], place[2] = x * depth, y * depth, depth
-            front = residual(camera, place, measured[n], r, J)
-        met = depth
-        if stereo:
-            met -= r[2] * depth * depth / (right_fu * shift)  # on the ray uR changes by f' b / z
+            front = residual(camera, place, measured[n], r, J) and r[0] + r[1] == r[0] + r[1]
+            if not (front and stereo):
+                break
+            met = depth - r[2] * depth * depth / (right_fu * shift)  # on the ray uR changes by f' b / z
+            if abs(r[2]) <= far:
+                break
         if not front:
             transform(T_world_left, np.zeros(3), out[n])
             continue

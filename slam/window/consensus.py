@@ -22,7 +22,7 @@ from slam.window.stereo import RectifiedMeasurement, RectifiedStereo
 CLEAR_MAJORITY = 0.7  #: share of the matches that agree with the guess at which no other pose is tried
 _BATCH = 10  # cost: hypotheses tried at once
 _ENOUGH = 100  # cost: matches that fix a pose far better than is needed to tell which others agree
-HYPOTHESES = 200  #: cost: poses tried in the search for one on which the landmarks agree
+_HYPOTHESES = 200  # cost: poses tried in the search for one on which the landmarks agree
 _CAMERA = np.eye(3)  # fixed: of bearings, not pixels
 
 
@@ -71,7 +71,7 @@ def landmarks_pose(measure: RectifiedMeasurement, points: Array, z: Array, T: Ar
     sigma, probability = measure.models.pixel_sigma, measure.models.gate_probability
     threshold = sigma * float(np.sqrt(2.0 * chi_square_limit(3, probability)))  # landmarks as uncertain as new ones
     measured = z + np.array([0.0, 0.0, measure.stereo.doffs])
-    found = find_consensus(measure.rig, points, measured, T, threshold, HYPOTHESES, seed)
+    found = find_consensus(measure.rig, points, measured, T, threshold, _HYPOTHESES, seed)
     return found.T_world_left if found.inliers.sum() >= max(MIN_CONSENSUS, (len(z) + 1) // 2) else None
 
 

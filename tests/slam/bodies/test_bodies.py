@@ -40,7 +40,7 @@ def test_a_body_is_predicted_by_its_own_motion_model() -> None:
 def test_a_body_exists_the_less_surely_the_longer_it_is_not_measured():
     body = new_body(1, np.zeros(3), np.zeros(6), np.zeros(4), 0.0, 0.1)
     for k in range(3):
-        later = with_evidence(replace(body, measured=False, existence=0.9 - 0.1 * k), 0, 0)
+        later = with_evidence(replace(body, measured=False, existence=0.9 - 0.1 * k), 0.0, 0, 0)
         assert later.existence < 0.9 - 0.1 * k
 
 
@@ -56,23 +56,26 @@ def test_points_behind_a_body_are_hidden_and_no_others():
 def test_existence_follows_bayes_rule():
     """Of 100 bodies 90 exist; where there is one it is seen in 8 of 10 frames: 18 of 28 unseen ones exist."""
     assert when_missed(0.9, seen=7, age=8) == pytest.approx(18 / 28)
-    assert when_measured(EVEN) == pytest.approx(20 / 21, rel=1e-2)  # clear: 20 to 1
-    assert when_measured(1.0 - 1e-12) < 1.0  # and never so certain that it could not be forgotten
+    assert when_measured(EVEN, gain=8.0) > 0.95 and when_measured(EVEN, gain=0.0) < 0.7  # at rest it shows little
+    assert when_measured(0.999999, gain=1e6) < 1.0  # and never so certain that it could not be forgotten
 
 
 @pytest.mark.parametrize(
-    ("measured", "missed", "existence", "told"),
+    ("measured", "missed", "since", "existence", "told"),
     [
-        (True, 0, 0.3, True),
-        (False, 5, 0.6, True),
-        (False, 6, 0.6, False),  # for more than a twentieth of the frames in which it was measured
-        (False, 5, 0.4, False),
+        (True, 0, 0.0, 0.3, True),
+        (False, 5, 0.9, 0.6, True),
+        (False, 6, 0.9, 0.6, False),  # for more than a twentieth of the frames in which it was measured
+        (False, 5, 1.1, 0.6, False),  # for more than a second
+        (False, 5, 0.9, 0.4, False),
     ],
 )
-def test_a_body_out_of_view_is_reported_for_a_short_while_only(measured, missed, existence, told) -> None:
+def test_a_body_out_of_view_is_reported_for_a_short_while_only(measured, missed, since, existence, told) -> None:
     body, tracks, _, _ = scene(4, np.zeros(6), np.random.default_rng(0))
     belief = replace(body.belief, estimate=replace(body.belief.estimate, measured=measured, stamp=10.0))
-    body = replace(body, belief=belief, certain=PROOF, seen=100, missed=missed, seen_at=9.5, existence=existence)
+    body = replace(
+        body, belief=belief, certain=PROOF, seen=100, missed=missed, seen_at=10.0 - since, existence=existence
+    )
     assert [(thing.measured_at, thing.existence) for thing in reported({1: body}, tracks, 1)] == (
-        [(9.5, existence)] if told else []
+        [(10.0 - since, existence)] if told else []
     )

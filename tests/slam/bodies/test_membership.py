@@ -117,7 +117,7 @@ def test_what_encloses_points_that_stand_still_is_no_body(still: int, behind: in
     body = replace(body_along(poses, np.arange(16), tracks), certain=certain)
     gains, against = membership.update_members({1: body}, FRAME, tracks)[1]
     assert against == (0 if behind and certain else still)
-    after = with_evidence(replace(body, certain=PROOF), int((gains > CLEAR).sum()), against)
+    after = with_evidence(replace(body, certain=PROOF), 0.0, int((gains > CLEAR).sum()), against)
     assert after.proven == solid
 
 
