@@ -95,18 +95,16 @@ def body_frame(A: Array, B: Array, C: Array) -> Array:
     return np.column_stack([v / np.linalg.norm(v) for v in (x, y, z)])
 
 
-def why_degenerate(points: Array) -> str:
-    """Why points A, B, C (3, 3) [m] make no frame: one line, or empty where they do."""
+def makes_frame(points: Array) -> bool:
+    """Whether points A, B, C (3, 3) [m] make a frame: all have a depth, lie far enough apart and not in a line."""
     if not np.isfinite(points).all():
-        return "a point has no depth"
+        return False
     sides = points[[1, 2, 2]] - points[[0, 0, 1]]
     lengths = np.linalg.norm(sides, axis=1)
     if lengths.min() < _LEAST_SIDE:
-        return f"two of the three points are {1e3 * lengths.min():.0f} mm apart, {1e3 * _LEAST_SIDE:.0f} mm are needed"
+        return False
     area = np.linalg.norm(np.cross(sides[0], sides[1]))
-    if area / np.sort(lengths)[1:].prod() < _LEAST_SINE:
-        return "the three points are nearly collinear"
-    return ""
+    return bool(area / np.sort(lengths)[1:].prod() >= _LEAST_SINE)
 
 
 def placed(current: Array, initial: Array, origin: Array) -> Array:
@@ -121,25 +119,20 @@ def placed(current: Array, initial: Array, origin: Array) -> Array:
 def detect(
     features: StereoFeatures, matches: tuple[NDArray[np.intp], NDArray[np.intp]], points: Array,
     database: ObjectDatabase,
-) -> tuple[NDArray[np.intp], str]:  # fmt: skip
-    """Three matches by which to measure the object's motion (steps a and c), or one line that says why there are none.
+) -> NDArray[np.intp]:  # fmt: skip
+    """Three matches by which to measure the object's motion (steps a and c), or none.
 
     `matches` are rows of the database and of the features (K,), `points` (K, 3) the features' in world coordinates [m].
     The three with the largest determinant (of the Hessian, the detector's response) are taken; where they make no
-    frame, see `why_degenerate`, the next ones. What is returned are places among the matches (3,).
+    frame, see `makes_frame`, the next ones. What is returned are places among the matches (3,).
     """
     known, rows = matches
-    none, reason = np.zeros(0, np.intp), ""
-    if len(rows) < 3:
-        return none, f"{len(rows)} features of the object recognised, 3 are needed"
     order = np.argsort(-features.response[rows], kind="stable")[:_CANDIDATES]
     for triple in sorted(combinations(range(len(order)), 3), key=lambda three: three[::-1]):  # by their weakest feature
         three = order[list(triple)]
-        why = why_degenerate(points[three]) or why_degenerate(database.points[known[three]])
-        if not why:
-            return three, ""
-        reason = reason or why
-    return none, reason
+        if makes_frame(points[three]) and makes_frame(database.points[known[three]]):
+            return three
+    return np.zeros(0, np.intp)
 
 
 def motion_covariance(current: Array, initial: Array, origin: Array, noise: Array) -> Array:
@@ -189,7 +182,7 @@ class Procedure1Detector(ObjectDetector):
         known, rows = found.tracks, free[found.features]
         local = self._rig.triangulate(features.uv_left[rows], features.uv_right[rows])
         points = transform(estimate.T_world_left, local)
-        three = detect(features, (known, rows), points, d)[0]
+        three = detect(features, (known, rows), points, d)
         moved = np.sort(tracks.ids[(tracks.ids >= 0) & isin(tracks.row, rows)])
         labels = MotionLabels(np.sort(rows), np.zeros(0, np.intp), moved)
         if not len(three):
