@@ -13,6 +13,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend
 from slam.models import EstimatorModels, MotionModel
+from tests.slam.numeric import chained
 
 RIG = StereoRig.rectified_pair(f=400.0, u0=320.0, v0=240.0, baseline=0.3, width=641, height=481)
 
@@ -33,11 +34,7 @@ class Scene:
 
 def path(frames: int, dt: float, velocity: Array, rate: Array) -> Array:
     """Poses (F, 4, 4) of constant body velocity [m/s] and body rate [rad/s] from the identity."""
-    step = se3.exp(dt * np.concatenate([rate, velocity]))
-    poses = [np.eye(4)]
-    for _ in range(frames - 1):
-        poses.append(poses[-1] @ step)
-    return np.array(poses)
+    return chained([se3.exp(dt * np.concatenate([rate, velocity]))] * (frames - 1))
 
 
 def random_path(frames: int, dt: float, velocity: Array, motion: MotionModel, rng: np.random.Generator) -> Array:
@@ -96,10 +93,7 @@ def begun_in_the_dark(seed: int) -> tuple[EstimatorModels, Array, list[Observati
     rng, dt = np.random.default_rng(seed), 0.1
     turns = 0.3 * np.cumsum(rng.standard_normal((160, 3)), axis=0) * np.sqrt(dt)
     steps = dt * np.concatenate([0.5 * np.sin(turns), 0.3 * np.cos(turns)], axis=1)
-    poses = [np.eye(4)]
-    for one in steps[1:]:
-        poses.append(poses[-1] @ se3.exp(one))
-    path = np.array(poses)
+    path = chained(se3.exp(steps[1:]))
     points = np.concatenate([cloud(path[:1], 2, rng), cloud(path[80:], 60, rng, 2.0, 6.0)])
     sights = []
     for k, T in enumerate(path):

@@ -13,6 +13,7 @@ from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.interfaces import MapBackend
 from slam.models import EstimatorModels, SlideModel
+from tests.slam.numeric import chained
 
 RIG = StereoRig.rectified_pair(f=400.0, u0=319.5, v0=239.5, baseline=0.2, width=640, height=480)
 SIGMA = 0.5
@@ -32,9 +33,7 @@ class Scene:
         self.believed = self.points + KNOWN * rng.standard_normal((40, 3))
         self.covariances = np.tile(KNOWN**2 * np.eye(3), (40, 1, 1))
         step = se3.exp(DT * np.array([0.02, 0.1, -0.05, 0.2, -0.1, 0.3]))
-        self.poses = [START]
-        for _ in range(frames - 1):
-            self.poses.append(self.poses[-1] @ step)
+        self.poses = START @ chained([step] * (frames - 1))
         self.seen = [self._observe(T, rng) for T in self.poses]
 
     def _observe(self, T, rng):

@@ -15,6 +15,7 @@ from slam.data import Estimate, FrameResult, Observations, Prediction, StereoFea
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import adjoint, exp, inverse, transform
 from slam.geometry.trajectory import Trajectory
+from tests.slam.numeric import chained
 
 LAP = 100  # frames
 BIAS, SIGMAS = np.array([0.0, 1e-3, 0.0, 0.0, 0.0, 5e-3]), np.array([1e-3, 2e-3, 1e-3, 5e-3, 5e-3, 1e-2])
@@ -71,11 +72,9 @@ class Odometry:
 def sequence(tmp_path_factory: pytest.TempPathFactory):
     """A round of 100 m, and 30 m of it once more."""
     step = exp(np.array([0.0, 2 * np.pi / LAP, 0.0, 0.0, 0.0, 1.0]))
-    poses = [np.eye(4)]
-    for _ in range(LAP + 29):
-        poses.append(poses[-1] @ step)
+    poses = chained([step] * (LAP + 29))
     file: Path = tmp_path_factory.mktemp("paths") / "round.txt"
-    Trajectory(0.1 * np.arange(len(poses)), np.array(poses)).write_tum(file)
+    Trajectory(0.1 * np.arange(len(poses)), poses).write_tum(file)
     return slam.open_sequence(f"synthetic:drive?path={file}&descriptor=16")
 
 

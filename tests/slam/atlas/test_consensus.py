@@ -14,6 +14,7 @@ from slam.atlas.keyframes import Keyframe, Loop
 from slam.atlas.pose_graph import Chain, PoseGraph
 from slam.data import CommonError
 from slam.geometry.se3 import Array, exp, inverse
+from tests.slam.numeric import chained
 
 LAP, DEPTH = 60, 2.0
 SIGMAS = np.repeat([2e-3, 0.05], 3)  # of a step
@@ -24,11 +25,7 @@ FALSE = exp(np.array([0.0, 0.0, 0.0, 1.5, 0.0, 0.0]))  # by which a place that l
 def drive(count: int) -> tuple[Array, Array]:
     """True poses and those of odometry (K, 4, 4) on rounds of 60 m."""
     rng, turn = np.random.default_rng(3), exp(np.array([0.0, 2 * np.pi / LAP, 0.0, 0.0, 0.0, 1.0]))
-    true, odom = [np.eye(4)], [np.eye(4)]
-    for _ in range(count - 1):
-        true.append(true[-1] @ turn)
-        odom.append(odom[-1] @ turn @ exp(SIGMAS * rng.normal(size=6)))
-    return np.array(true), np.array(odom)
+    return chained([turn] * (count - 1)), chained(turn @ exp(SIGMAS * rng.normal(size=(count - 1, 6))))
 
 
 TRUE, ODOM = drive(2 * LAP)

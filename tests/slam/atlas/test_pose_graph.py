@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -13,6 +12,7 @@ from slam.atlas.closing import disagreement, is_informative
 from slam.atlas.keyframes import Loop
 from slam.atlas.pose_graph import Chain, PoseGraph
 from slam.geometry.se3 import exp, inverse, log
+from tests.slam.numeric import chained
 
 SIGMAS = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.03])
 
@@ -20,25 +20,25 @@ SIGMAS = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.03])
 def circle(count: int = 60, laps: float = 1.5) -> np.ndarray:
     """True poses (N, 4, 4) of a camera that goes round and comes back."""
     step = exp(np.array([0.0, 2 * np.pi * laps / count, 0.0, 0.0, 0.0, 1.0]))
-    poses = [np.eye(4)]
-    for _ in range(count - 1):
-        poses.append(poses[-1] @ step)
-    return np.array(poses)
+    return chained([step] * (count - 1))
+
+
+def steps_of(poses: np.ndarray) -> np.ndarray:
+    """From each pose (N, 4, 4) to the next."""
+    return inverse(poses[:-1]) @ poses[1:]
 
 
 def problem(seed: int) -> tuple[np.ndarray, Chain, tuple[Loop, ...]]:
     """True poses, a chain with drift, and loops after one lap."""
     rng = np.random.default_rng(seed)
     true = circle()
-    odom = [true[0]]
-    for before, now in pairwise(true):
-        odom.append(odom[-1] @ inverse(before) @ now @ exp(rng.normal(size=6) * SIGMAS))
+    odom = chained(steps_of(true) @ exp(rng.normal(size=(len(true) - 1, 6)) * SIGMAS))
     sigma = np.array([1e-3, 1e-3, 1e-3, 0.02, 0.02, 0.02])
     loops = tuple(
         Loop(i, i + 40, inverse(true[i]) @ true[i + 40] @ exp(rng.normal(size=6) * sigma), np.diag(sigma**2), 50)
         for i in (2, 9, 15)
     )
-    return true, Chain(np.array(odom), np.tile(np.diag(SIGMAS**2), (len(true), 1, 1))), loops
+    return true, Chain(odom, np.tile(np.diag(SIGMAS**2), (len(true), 1, 1))), loops
 
 
 def whole(chain: Chain, loops: tuple[Loop, ...]) -> tuple[gtsam.Values, gtsam.Marginals]:
@@ -81,11 +81,9 @@ def problem_with_common_errors(seed: int) -> tuple[np.ndarray, Chain, tuple[Loop
     """As `problem`, where each step is turned too far and too long by what all steps share (2,)."""
     true, chain, loops = problem(seed)
     errors = np.random.default_rng(1000 + seed).normal(size=2)
-    odom = [true[0]]
-    for before, now in pairwise(chain.poses):
-        odom.append(odom[-1] @ inverse(before) @ now @ exp(-TURN_AND_SCALE @ errors))
+    odom = chained(steps_of(chain.poses) @ exp(-TURN_AND_SCALE @ errors))
     common = np.tile(TURN_AND_SCALE, (len(true), 1, 1))
-    return true, Chain(np.array(odom), chain.steps, common), loops, errors
+    return true, Chain(odom, chain.steps, common), loops, errors
 
 
 def test_common_errors_are_found_and_the_covariance_is_right():
@@ -131,16 +129,14 @@ def test_steps_without_noise_leave_a_covariance():
         some = [*range(10, 16), *range(50, 56)]  # keyframes one after the other that all close a loop
         steps = np.tile(np.diag(SIGMAS**2), (len(true), 1, 1))
         steps[some, :, 2:] = steps[some, 2:, :] = 0
-        odom = [true[0]]
-        for k in range(1, len(true)):
-            noise = common[k] @ errors + np.sqrt(np.diagonal(steps[k])) * rng.normal(size=6)
-            odom.append(odom[-1] @ inverse(true[k - 1]) @ true[k] @ exp(-noise))
+        sigmas = np.sqrt(np.diagonal(steps, axis1=1, axis2=2))[1:]
+        odom = chained(steps_of(true) @ exp(-(common[1:] @ errors + sigmas * rng.normal(size=sigmas.shape))))
         P = np.diag(np.repeat([1e-3, 0.02], 3) ** 2)
         loops = [
             Loop(k, k + 40, inverse(true[k]) @ true[k + 40] @ exp(np.linalg.cholesky(P) @ rng.normal(size=6)), P, 50)
             for k in range(9, 16)
         ]
-        solution = PoseGraph.solved(Chain(np.array(odom), steps, common), loops, np.array(odom))
+        solution = PoseGraph.solved(Chain(odom, steps, common), loops, odom)
         assert np.linalg.eigvalsh(solution.covariance())[0] > 0
         error = np.concatenate([log(inverse(solution.keyframe_poses()[-1]) @ true[-1]), errors - solution.common])
         nees.append(error @ np.linalg.solve(solution.covariance(), error))
