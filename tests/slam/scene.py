@@ -20,6 +20,15 @@ GENERAL_RIG = StereoRig(
 )
 
 
+def features_at(
+    left: np.ndarray, right: np.ndarray, looks: np.ndarray, stamp: float = 0.0, response: np.ndarray | None = None
+) -> StereoFeatures:
+    """Features at pixels (N, 2) that differ in their descriptors (N, D), and in their response (N,) if it is given."""
+    one = np.ones(len(left))
+    strength = one if response is None else response
+    return StereoFeatures(stamp, left, right, one, 0 * one, strength, one.astype(np.int8), looks)
+
+
 class Cloud:
     """Points with unit descriptors; what a camera sees of them."""
 

@@ -22,6 +22,7 @@ from slam.models import EstimatorModels
 from slam.tracks.config import AssociationConfig
 from slam.tracks.localizer import Localizer
 from slam.tracks.mapper import depth_is_known
+from tests.slam.scene import features_at
 
 SIGMA = 0.5
 CAMERA = PinholeCamera(300.0, 300.0, 320.0, 180.0, 640, 360)
@@ -44,8 +45,7 @@ def view(T_world_left: Array, points: Array, descriptors: Array, seed: int) -> S
     seen = RIG.left.in_image(left) & RIG.right.in_image(right)
     left = left[seen] + rng.normal(0, SIGMA, (seen.sum(), 2))
     right = np.column_stack([right[seen, 0] + rng.normal(0, SIGMA, seen.sum()), left[:, 1]])
-    one = np.ones(seen.sum())
-    return StereoFeatures(0.0, left, right, one, 0 * one, one, one.astype(np.int8), descriptors[seen])
+    return features_at(left, right, descriptors[seen])
 
 
 def keyframe(features: StereoFeatures) -> Keyframe:

@@ -7,9 +7,9 @@ import numpy as np
 from slam.calibration import RigCorrection, RigModel, SelfCalibration, SelfCalibrationConfig
 from slam.calibration.model import RESIDUAL
 from slam.calibration.posterior import field_variance
-from slam.data import StereoFeatures
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
+from tests.slam.scene import features_at
 
 CAR = StereoRig.rectified_pair(720, 610, 173, 0.54, 1242, 375)
 
@@ -51,8 +51,7 @@ class Street:
         left, right = z[:, :2], np.column_stack([z[:, 2], z[:, 1] + vertical])
         left = left + noise * rng.standard_normal((n, 2))
         right = right + noise * rng.standard_normal((n, 2))
-        ones = np.ones(n)
-        return StereoFeatures(stamp, left, right, ones, ones, ones, np.ones(n, np.int8), self.descriptors[ids])
+        return features_at(left, right, self.descriptors[ids], stamp)
 
 
 def pose(k, step=1.2):

@@ -8,12 +8,11 @@ import pytest
 from slam.calibration import RigCorrection, RigModel, RigPosterior, SelfCalibration, SelfCalibrationConfig
 from slam.calibration.posterior import prior_information
 from slam.config import SystemConfig
-from slam.data import StereoFeatures
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.system import StereoSlam
 from tests.slam.calibration.drives import CAR, Street, disparity_error, drive, parameters, pose, residual_fields
-from tests.slam.scene import GENERAL_RIG, RIG, Cloud
+from tests.slam.scene import GENERAL_RIG, RIG, Cloud, features_at
 
 #: A turn of the right camera after a knock [rad].
 TURNED = parameters(pitch=5e-4, yaw=5e-4, roll=5e-4)
@@ -56,8 +55,7 @@ def test_pairs_without_a_common_motion_are_counted_and_told():
         looks, n = street.descriptors[50 * k : 50 * k + 80], 80  # 30 of them are in the next view
         left = rng.uniform([100, 50], [1100, 320], (n, 2))
         right = left - np.column_stack([rng.uniform(5, 60, n), np.zeros(n)])
-        ones = np.ones(n)
-        calibration.observe(StereoFeatures(k, left, right, ones, ones, ones, np.ones(n, np.int8), looks), pose(k))
+        calibration.observe(features_at(left, right, looks, k), pose(k))
     assert calibration.pairs == 0
     assert calibration.summary()["unsolved_pairs"] == calibration.unsolved >= 4
 

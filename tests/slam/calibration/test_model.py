@@ -10,12 +10,11 @@ import pytest
 from slam.calibration import Revision, RigCorrection, RigModel
 from slam.calibration.pairs import Pair, View, fit_motion, match, move, noise_variances, pair_evidence, pair_of
 from slam.calibration.posterior import prior_information
-from slam.data import StereoFeatures
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from tests.slam.calibration.drives import CAR, Street, parameters
 from tests.slam.numeric import jacobian
-from tests.slam.scene import GENERAL_RIG
+from tests.slam.scene import GENERAL_RIG, features_at
 
 MODEL = RigModel(CAR)
 F = MODEL.focal
@@ -81,8 +80,7 @@ def test_features_are_corrected_and_revised(rig):
     points = rng.uniform((-2, -1, 5), (2, 1, 10), (20, 3))
     left, right = rig.rectified.rig.project(points)
     right[3] = np.nan
-    ones = np.ones(20)
-    features = StereoFeatures(0.0, left, right, ones, ones, ones, np.ones(20, np.int8), np.ones((20, 4), np.float32))
+    features = features_at(left, right, np.ones((20, 4), np.float32))
     corrected = before.features(features)
     assert np.isnan(corrected.uv_right[3]).all() and np.isfinite(corrected.uv_left).all()
     rows = [np.column_stack([f.uv_left, f.uv_right[:, 0]]) for f in (features, corrected, after.features(features))]

@@ -3,23 +3,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.se3 import angles, exp, inverse, log, pose, rotation, transform
 from slam.papers.procedure1 import ObjectDatabase, body_frame, detect, makes_frame, motion_covariance, placed
-from tests.slam.scene import RIG
+from tests.slam.scene import RIG, features_at
 
 POINTS = np.array([[0.0, 0.1, 1.5], [0.2, 0.12, 1.55], [0.05, 0.25, 1.45], [0.15, 0.2, 1.6]])
 MOTION = pose(rotation(np.radians([-35.0, -15.1, 5.8])), np.array([0.1, -0.05, 0.2]))
 
 
 def features_of(points, response=(4.0, 3.0, 2.0, 1.0)):
-    left, right = RIG.project(points)
     n = len(points)
-    descriptors = np.eye(n, 16, dtype=np.float32)
-    return StereoFeatures(
-        0.0, left, right, np.full(n, 9.0), np.zeros(n), np.array(response[:n]), np.ones(n, np.int8), descriptors
-    )
+    return features_at(*RIG.project(points), np.eye(n, 16, dtype=np.float32), response=np.array(response[:n]))
 
 
 def test_body_frame_is_as_printed():

@@ -15,23 +15,23 @@ from slam.tracks import alignment
 from slam.tracks.alignment import warps_of
 from slam.tracks.step import LandmarkMatches
 from slam.tracks.table import LandmarkTable, Patch
+from tests.slam.scene import features_at
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
 
 
 def rows(ids: IdArray, T: np.ndarray | None = None, size: float = 15.0) -> LandmarkTable:
     """Landmarks, with patches taken from a pose."""
-    features = _features(len(ids))
+    features = alike(len(ids))
     landmarks = LandmarkTable(ids, features.descriptors, features.laplacian)
     if T is not None:
         landmarks.patches[:] = Patch(np.zeros((5, 5), np.float32), np.full(2, 2.0), size, T)
     return landmarks
 
 
-def _features(count: int) -> slam.StereoFeatures:
-    z = np.zeros(count)
-    looks = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
-    return slam.StereoFeatures(0.0, np.zeros((count, 2)), np.zeros((count, 2)), z, z, z, z.astype(np.int8), looks)
+def alike(count: int) -> slam.StereoFeatures:
+    uv = np.zeros((count, 2))
+    return features_at(uv, uv, np.tile(np.float32([1, 0, 0, 0]), (count, 1)))
 
 
 def test_warps_are_the_derivative_of_a_surface_that_faces_the_camera():
@@ -78,7 +78,7 @@ def frame(right: bool = True) -> slam.StereoFeatures:
     image = np.zeros((240, 320), np.float32)
     uv_right = uv - [10.0, 0.0] if right else np.full((4, 2), np.nan)
     pair = ImagePair(image, image if right else None)
-    return replace(_features(4), uv_left=uv, uv_right=uv_right, scale=np.full(4, 15.0), images=pair)
+    return replace(alike(4), uv_left=uv, uv_right=uv_right, scale=np.full(4, 15.0), images=pair)
 
 
 def align(features: slam.StereoFeatures, landmarks: LandmarkTable, seen: LandmarkMatches = SEEN):

@@ -9,7 +9,7 @@ from slam.data import Prediction, StereoFeatures
 from slam.geometry import se3
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import Windows, follow, match_everywhere, match_near
-from tests.slam.scene import RIG, Cloud
+from tests.slam.scene import RIG, Cloud, features_at
 
 CONFIG = AssociationConfig()
 WIDE = CONFIG.wide_d_match, CONFIG.wide_ratio
@@ -50,16 +50,10 @@ def test_windows_are_the_innovations_ellipses(sigma):
     S = A @ np.swapaxes(A, 1, 2) + 0.1 * np.eye(2)
     offset = np.einsum("nij,nj->ni", np.linalg.cholesky(S), rng.normal(size=(300, 2))) * rng.uniform(0, 5, (300, 1))
     squared = np.einsum("ni,nij,nj->n", offset, np.linalg.inv(S), offset)
-    look, sign, config = (
-        np.eye(1, 8, dtype=np.float32),
-        np.ones(1, np.int8),
-        AssociationConfig(window_min=1e-3, window_max=1e4),
-    )
-    one, none = np.ones(1), np.full((1, 2), np.nan)
-    features = [StereoFeatures(0.0, uv[None], none, one, one, one, sign, look) for uv in offset]
-    inside = np.array(
-        [len(follow(np.zeros((1, 2)), P[None], look, sign, f, windows(config))) for P, f in zip(S, features)]
-    )
+    look, sign, none = np.eye(1, 8, dtype=np.float32), np.ones(1, np.int8), np.full((1, 2), np.nan)
+    within = windows(AssociationConfig(window_min=1e-3, window_max=1e4))
+    features = [features_at(uv[None], none, look) for uv in offset]
+    inside = np.array([len(follow(np.zeros((1, 2)), P[None], look, sign, f, within)) for P, f in zip(S, features)])
     clear = np.abs(np.sqrt(squared) - 5.0) > 1e-3  # float32 at the very edge
     assert 30 < inside.sum() < 270
     np.testing.assert_array_equal(inside[clear], (squared <= 25.0)[clear])
@@ -115,8 +109,7 @@ def test_no_greedy_theft():
 
 def test_tracks_that_look_alike_to_the_bit_share_a_feature():
     look, sign = np.eye(1, 8, dtype=np.float32), np.ones(1, np.int8)
-    one = np.ones(1)
-    feature = StereoFeatures(0.0, np.zeros((1, 2)), np.full((1, 2), np.nan), one, one, one, sign, look)
+    feature = features_at(np.zeros((1, 2)), np.full((1, 2), np.nan), look)
     many = np.zeros((500, 2)), np.tile(np.eye(2), (500, 1, 1)), look.repeat(500, axis=0), sign.repeat(500)
     matches = follow(*many, feature, windows(CONFIG))
     assert matches.tracks.tolist() == list(range(500)) and not matches.features.any()

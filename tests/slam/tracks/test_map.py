@@ -4,23 +4,19 @@ import numpy as np
 import pytest
 
 from slam.config import SystemConfig
-from slam.data import StereoFeatures
 from slam.system import StereoSlam
 from slam.tracks.config import MapConfig
 from slam.tracks.mapper import MapView, depth_is_known, new_landmarks, surplus_landmarks, take_census
 from slam.tracks.table import LandmarkTable
-from tests.slam.scene import RIG
+from tests.slam.scene import RIG, features_at
 
 CONFIG = MapConfig(target_in_view=20, separation=5.0)
 
 
-def features_at(uv, depth=3.0, response=None):
+def at_depth(uv, depth=3.0, response=None):
     uv = np.asarray(uv, float)
-    n = len(uv)
-    right = uv - np.outer(RIG.left.fu * RIG.baseline / depth * np.ones(n), [1, 0])
-    d = np.eye(16, dtype=np.float32)[np.arange(n) % 16]
-    response = np.ones(n) if response is None else np.asarray(response, float)
-    return StereoFeatures(0.0, uv, right, np.ones(n), np.zeros(n), response, np.ones(n, np.int8), d)
+    right = uv - np.outer(RIG.left.fu * RIG.baseline / depth * np.ones(len(uv)), [1, 0])
+    return features_at(uv, right, np.eye(16, dtype=np.float32)[np.arange(len(uv)) % 16], response=response)
 
 
 def chosen(features, occupied=(), config=CONFIG, free=None):
@@ -33,7 +29,7 @@ def test_features_of_uncertain_depth_do_not_become_landmarks():
     uv = np.stack(np.meshgrid(np.arange(60, 300, 40), np.arange(40, 200, 40)), axis=-1).reshape(-1, 2)
     far = np.arange(len(uv)) % 2 == 1
     system = StereoSlam(RIG, None, "ekf", config=SystemConfig(map=MapConfig(target_in_view=40)))
-    system.process_features(features_at(uv, np.where(far, 60.0, 3.0)))
+    system.process_features(at_depth(uv, np.where(far, 60.0, 3.0)))
     assert (system.estimate().positions[:, 2] < 4.0).all() and len(system.landmarks) == (~far).sum()
 
 
@@ -47,30 +43,30 @@ def rows_with(**columns):
 def test_empty_regions_come_first_and_none_lies_close_to_another():
     rng = np.random.default_rng(0)
     uv = rng.uniform((10, 10), (310, 230), (300, 2))
-    new = chosen(features_at(uv, response=rng.random(300)))
+    new = chosen(at_depth(uv, response=rng.random(300)))
     gaps = np.linalg.norm(uv[new][:, None] - uv[new][None], axis=2) + 1e9 * np.eye(20)
     assert gaps.min() >= 5.0
     left = [(20.0 + 8 * i, 100.0 + 8 * j) for i in range(5) for j in range(5)]
     right = [(300.0, 100.0), (300.0, 110.0)]
-    features = features_at(left + right, response=[10.0] * 25 + [0.1] * 2)
+    features = at_depth(left + right, response=np.repeat([10.0, 0.1], [25, 2]))
     config = MapConfig(target_in_view=8, separation=5.0, grid=(2, 1))
     assert {25, 26} <= set(chosen(features, occupied=[(10, 10)] * 4, config=config).tolist())
 
 
 def test_features_on_landmarks_and_without_depth_are_left_out():
-    features = features_at([(50, 50), (100, 100), (200, 100), (250, 50)])
+    features = at_depth([(50, 50), (100, 100), (200, 100), (250, 50)])
     features.uv_right[2] = np.nan
     free = np.array([True, True, True, False])
     assert chosen(features, occupied=[(51, 51)], free=free).tolist() == [1]
     # f B = 36 px m: at 3 m the disparity is 12 px and 1.4 px of noise are 12 %; at 6 m they are 24 %.
-    assert len(chosen(features_at([(100, 100)], depth=6.0))) == 0
+    assert len(chosen(at_depth([(100, 100)], depth=6.0))) == 0
 
 
 def census(rows, config, positions=None, features=None, frame=9, expected=True, measured=(), withheld=()):
     """Which landmarks go, and which features are one of them, after a frame with the camera at the origin."""
     n = len(rows.ids)
     positions = np.zeros((n, 3)) if positions is None else positions  # none is in the image
-    features = features_at(np.zeros((0, 2))) if features is None else features
+    features = at_depth(np.zeros((0, 2))) if features is None else features
     view = MapView.of(RIG, np.eye(4), positions, features, 1.0)
     marks = (np.full(n, expected), np.isin(rows.ids, measured), np.isin(rows.ids, withheld))
     return [x.tolist() for x in take_census(rows, np.arange(n), view, *marks, frame, features, RIG, config)]
@@ -85,7 +81,7 @@ def test_erase_what_is_missed_or_seldom_seen_and_none_where_nothing_takes_its_pl
     config = MapConfig(erase_missed=5, erase_share=0.3)
     columns = {"seen": [9, 9, 2, 2, 1], "in_view": [10, 14, 10, 5, 1], "missed": [1, 5, 1, 3, 0]}
     assert census(rows_with(**columns), config)[0] == [False, True, True, False, False]
-    blind = features_at([(1, 1)])
+    blind = at_depth([(1, 1)])
     blind.uv_right[:] = np.nan
     assert census(rows_with(**columns), config, features=blind)[0] == 5 * [False]
 
@@ -145,7 +141,7 @@ def like(features, rows, seen):
 
 
 def test_features_and_landmarks_that_are_a_landmark_already_are_known():
-    features = features_at([(100, 100), (200, 100), (250, 50)], depth=3.0)
+    features = at_depth([(100, 100), (200, 100), (250, 50)], depth=3.0)
     a, b, c = RIG.triangulate(features.uv_left, features.uv_right)
     # The first: 0.2 m deeper, within the uncertainty of 12 %. The second: as deep, but 20 px away. The third looks
     # like another feature.
@@ -159,10 +155,8 @@ def test_features_and_landmarks_that_are_a_landmark_already_are_known():
 
 def test_hidden_landmarks_are_not_expected():
     """Two landmarks at 6 m: one among features at 2 m, one among features as far as itself; one at the border."""
-    near = features_at([(100 + i, 100 + j) for i in (-6, 0, 6) for j in (-6, 6)], depth=2.0)
-    far = features_at([(220 + i, 100 + j) for i in (-6, 0, 6) for j in (-6, 6)], depth=6.0)
-    names = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
-    both = StereoFeatures(0.0, *(np.concatenate([getattr(near, n), getattr(far, n)]) for n in names))
+    uv = [(column + i, 100 + j) for column in (100, 220) for i in (-6, 0, 6) for j in (-6, 6)]
+    both = at_depth(uv, np.repeat([2.0, 6.0], 6))
     rays = np.column_stack([RIG.left.normalise(np.array([(100.0, 100), (220, 100), (5, 100)])), np.ones(3)])
     rows = rows_with(seen=np.zeros(3, np.int64))
     census(rows, CONFIG, 6.0 * rays, both)

@@ -9,12 +9,12 @@ import pytest
 
 from slam.atlas.map_io import SavedMap
 from slam.config import SystemConfig
-from slam.data import FrameStatus, StereoFeatures
+from slam.data import FrameStatus
 from slam.geometry import se3
 from slam.system import StereoSlam
 from slam.tracks.monocular import depths_by_motion, frame_covariance, two_view_depth
 from slam.tracks.table import Tracks
-from tests.slam.scene import RIG, Cloud
+from tests.slam.scene import RIG, Cloud, features_at
 
 BACKENDS = ("ekf", "smoother", "window")
 STEP = se3.exp(np.array([0.02, 0.05, -0.03, 0.3, 0.05, 0.1]))  # the camera now, in its coordinates then
@@ -80,8 +80,7 @@ def test_a_frames_own_covariance_is_that_of_its_least_squares_pose():
 
 def left_features(n, stamp, uv):
     """Features (n,) of the left image that look alike to the bit."""
-    one, look = np.ones(n), np.tile(np.eye(1, 8, dtype=np.float32), (n, 1))
-    return StereoFeatures(stamp, uv, uv * np.nan, one, one, one, one.astype(np.int8), look)
+    return features_at(uv, uv * np.nan, np.tile(np.eye(1, 8, dtype=np.float32), (n, 1)), stamp)
 
 
 def test_a_feature_that_is_as_like_to_two_waiting_tracks_is_nobodys():

@@ -16,7 +16,7 @@ from slam.geometry.se3 import exp, inverse, log, transform
 from slam.system import StereoSlam
 from slam.tracks.standing import Standing
 from slam.tracks.step import HIDDEN
-from tests.slam.scene import RIG, Cloud
+from tests.slam.scene import RIG, Cloud, features_at
 
 SIGMA = 0.3
 
@@ -38,8 +38,7 @@ class Scene:
         z, _ = RIG.project_stereo(local, jacobian=False)
         z = z + self.rng.normal(0, SIGMA, z.shape)
         shown = ~self.body if body is False else RIG.left.in_view(local) | (body is None)
-        z, descriptors, one = z[shown], self.descriptors[shown], np.ones(shown.sum())
-        return StereoFeatures(0.1 * k, z[:, :2], z[:, [2, 1]], one, one, one, one.astype(np.int8), descriptors)
+        return features_at(z[shown, :2], z[shown][:, [2, 1]], self.descriptors[shown], 0.1 * k)
 
 
 def after(frames: list[StereoFeatures]) -> Standing:

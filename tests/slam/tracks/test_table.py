@@ -7,14 +7,15 @@ import pytest
 
 from slam.data import StereoFeatures
 from slam.tracks.table import LandmarkTable, Tracks
+from tests.slam.scene import features_at
 
 HERE = np.zeros(3)
 
 
 def features(count: int) -> StereoFeatures:
     """Features that all look otherwise."""
-    one, uv = np.ones(count), np.zeros((count, 2))
-    return StereoFeatures(0.0, uv, uv, one, one, one, one.astype(np.int8), np.eye(count, 8, dtype=np.float32))
+    uv = np.zeros((count, 2))
+    return features_at(uv, uv, np.eye(count, 8, dtype=np.float32))
 
 
 def followed(count: int) -> Tracks:
