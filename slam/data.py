@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slam.checks import FARTHEST_PIXEL
 from slam.errors import MeasurementError
-from slam.geometry.arrays import Array, changed
+from slam.geometry.arrays import Array, Table, changed
 from slam.geometry.arrays import BoolArray as BoolArray
 from slam.geometry.arrays import IdArray as IdArray
 from slam.geometry.arrays import IndexArray as IndexArray
@@ -123,7 +123,7 @@ class StereoFeatures:
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class Observations(Table):
     """Landmarks seen in one frame, a row each.
 
     Attributes:
@@ -155,17 +155,10 @@ class Observations:
 
     __repr__ = of_shapes
 
-    def __len__(self) -> int:
-        return len(self.ids)
-
     @property
     def has_stereo(self) -> BoolArray:
         """Which observations have a right pixel (M,)."""
         return np.asarray(np.isfinite(self.uv_right).all(axis=1))
-
-    def select(self, rows: NDArray) -> Observations:
-        """The observations of these rows (a mask or indices)."""
-        return Observations(self.ids[rows], self.uv_left[rows], self.uv_right[rows])
 
     @classmethod
     def empty(cls) -> Observations:

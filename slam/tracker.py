@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import reduce
 
 import numpy as np
 
@@ -88,7 +89,7 @@ class State:
 
     def path(self) -> Trajectory:
         """The path by all back ends so far, in their frame."""
-        return Trajectory.joined([*self.past, checked(self.backend, "trajectory", self.backend.trajectory())])
+        return reduce(Trajectory.joined, [*self.past, checked(self.backend, "trajectory", self.backend.trajectory())])
 
 
 @dataclass(frozen=True, eq=False)

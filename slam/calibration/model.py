@@ -53,9 +53,9 @@ class RigModel:
         half = 0.5 * np.array([rig.width - 1, rig.height - 1])
         self._centre, self._half = (half - self.origin) / self.focal, half / self.focal
 
-    def far(self, columns: int = 15, rows: int = 7) -> Array:
-        """Points at infinity ``(x, y, 0)`` (N, 3) [px] spread evenly over the left image."""
-        x, y = np.meshgrid(np.linspace(-1, 1, columns), np.linspace(-1, 1, rows))
+    def far(self) -> Array:
+        """Points at infinity ``(x, y, 0)`` (105, 3) [px] spread evenly over the left image."""
+        x, y = np.meshgrid(np.linspace(-1, 1, 15), np.linspace(-1, 1, 7))
         xy = self._centre + self._half * np.column_stack([x.ravel(), y.ravel()])
         return self.focal * np.column_stack([xy, np.zeros(len(xy))])
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ import numpy as np
 
 from slam.errors import TrajectoryError
 from slam.files import read_text, write_text
+from slam.geometry.arrays import Table
 from slam.geometry.se3 import Array, nearest_rotation, pose, quaternion, rotation_from_quaternion, so3_exp
 from slam.naming import count
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(Table):
     """Poses over time.
 
     Attributes:
@@ -50,9 +50,6 @@ class Trajectory:
         if (np.diff(self.stamps) <= 0).any():
             row = int(np.argmax(np.diff(self.stamps) <= 0)) + 1
             raise TrajectoryError(f"trajectory: time does not increase at row {row}")
-
-    def __len__(self) -> int:
-        return len(self.stamps)
 
     def __repr__(self) -> str:
         seconds = float(self.stamps[-1] - self.stamps[0]) if len(self) else 0.0
@@ -98,19 +95,10 @@ class Trajectory:
         """Length of the path [m]."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
-    def select(self, rows: np.ndarray | slice) -> Trajectory:
-        """The poses of these rows (a mask, indices or a slice)."""
-        return Trajectory(self.stamps[rows], self.poses[rows])
-
     @classmethod
     def empty(cls) -> Trajectory:
         """No pose."""
         return cls(np.zeros(0), np.zeros((0, 4, 4)))
-
-    @classmethod
-    def joined(cls, parts: Sequence[Trajectory]) -> Trajectory:
-        """Paths that follow each other in time, as one."""
-        return cls(np.concatenate([p.stamps for p in parts]), np.concatenate([p.poses for p in parts]))
 
     def write_tum(self, path: str | Path) -> None:
         """Write ``stamp tx ty tz qx qy qz qw`` lines."""
