@@ -32,7 +32,7 @@ def narrowed(values: np.ndarray, dtype: type[np.floating[Any]]) -> NDArray[Any]:
 
 
 def isin(ids: IdArray | IndexArray, members: IdArray | IndexArray) -> BoolArray:
-    """Which of `ids` (N,) are among `others` (M,): ``np.isin``, which takes several times as long for so few."""
+    """Which of `ids` (N,) are among `members` (M,): ``np.isin``, which takes several times as long for so few."""
     if len(ids) + len(members) > 2 * 500:  # 500: NumPy is quicker with more
         return np.isin(ids, members)
     return np.fromiter(map(set(members.tolist()).__contains__, ids.tolist()), bool, len(ids))
