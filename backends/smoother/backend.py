@@ -11,7 +11,6 @@ import numpy as np
 from backends.smoother.config import SmootherConfig
 from backends.smoother.factors import FactorMaker
 from backends.smoother.graph import Graph
-from backends.smoother.mending import corrected, rebuilt
 from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
 from slam.bounds import from_options
@@ -164,7 +163,7 @@ class SmootherBackend:
         s = self._started("sensitivities")
         return s.by_rig[6:].copy(), s.landmarks.by_rig[s.landmarks.rows_of(ids)]
 
-    # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
+    # --- corrected measurements (documented in slam.interfaces.RevisingBackend) ---
 
     @property
     def revises_path(self) -> bool:
@@ -181,7 +180,7 @@ class SmootherBackend:
         """
         s = self.state
         if s.started:
-            before, s = s, rebuilt(corrected(s, correct), self._steps, self._graph)
+            before, s = s, self._steps.revised(s, self._graph, correct)
             # what the landmarks move by is none of their error: it is the last of the rig's (`RevisingBackend.revise`)
             if not self.revises_path:
                 by_rig = s.landmarks.by_rig.copy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -14,7 +15,6 @@ from slam.geometry.se3 import Array, points_by_pose
 from slam.window.stereo import RectifiedStereo
 
 RECENT = 12  # cost: so many of its last measurements give a landmark's position and covariance
-VARIABLE = -(10**9)  #: in place of `SmootherLandmarks.since`: no smart factor, but a variable of the graph
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,8 @@ class SmootherLandmarks(LandmarkRows):
     world: BoolArray  # whether that does not depend on any pose (S,)
     z: Array  # its last measurements (S, RECENT, 3)
     pose: IndexArray  # and the numbers of their poses (S, RECENT), −1 for none
-    # age (`SmootherState.ages`) from which the span of its smart factor counts (S,); or VARIABLE, but not of known ones
-    since: IndexArray
+    since: IndexArray  # age (`SmootherState.ages`) from which the span of its smart factor counts (S,)
+    variable: BoolArray  # whether it is a variable of the graph instead (S,); not of those that are known beforehand
     linearised: Array  # where the graph has it linearised, if it is a variable (S, 3) [m]
     by_rig: Array  # derivatives of the positions by errors of the rig (S, 3, m)
 
@@ -43,7 +43,8 @@ class SmootherLandmarks(LandmarkRows):
         n = len(ids)
         return cls(
             ids, serial + np.arange(n), position, own, np.zeros((n, 3, 3)), position, information, np.full(n, world),
-            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp), position, by_rig,
+            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp), np.zeros(n, bool),
+            position, by_rig,
         )  # fmt: skip
 
     @classmethod
@@ -56,6 +57,11 @@ class SmootherLandmarks(LandmarkRows):
     def from_newest(self) -> Array:
         """Covariances (S, 3, 3) of the positions where the newest pose is known, in world axes."""
         return self.own + self.away
+
+    @cached_property
+    def variables(self) -> dict[int, Array]:
+        """Positions (3,) of those that are variables, by serial number."""
+        return dict(zip(self.serial[self.variable].tolist(), self.position[self.variable]))
 
     def spans(self, rows: IndexArray, last: IndexArray, age: int, track: int, solved: int) -> IndexArray:
         """`since` (M,) of landmarks that a pose of an `age` measures; the last that did were of ages (M,), −1 for none.
@@ -70,7 +76,7 @@ class SmootherLandmarks(LandmarkRows):
         longer = (last >= 0) & (0 <= solved < age - 1) & (since > solved - track) & (self.serial[rows] // 2 % 2 == 0)
         anew = np.where(since <= age - track, age, since)
         anew = np.where((last < 0) | (last < age - half), age - self.serial[rows] % half, anew)
-        return np.where(longer | (since == VARIABLE), since, anew)
+        return np.where(longer, since, anew)
 
     def measured(self, rows: IndexArray, z: Array, pose: int, since: IndexArray, oldest: int) -> Self:
         """With one more measurement (M, 3) of some landmarks, from the pose of a number, in factors `since` (M,).
@@ -109,7 +115,7 @@ class SmootherLandmarks(LandmarkRows):
         """
         if len(rows) > most:
             return self
-        variable, since = self.since == VARIABLE, self.since.copy()
+        variable, since = self.variable.copy(), self.since.copy()
         deviation = np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2))
         offset = np.linalg.norm(self.position[rows] - self.linearised[rows], axis=1)
         apart = ratio * np.where(variable[rows], offset, deviation)
@@ -119,11 +125,11 @@ class SmootherLandmarks(LandmarkRows):
         leaving = np.flatnonzero(variable & (last < age - track))
         leaving = leaving[np.argsort(last[leaving], kind="stable")][: max(int(variable.sum()) + len(new) - most, 0)]
         new = np.sort(new)[: most - int(variable.sum()) + len(leaving)]
-        since[leaving] = since[rows[variable[rows] & nonlinear]] = age - track  # full
-        since[new] = VARIABLE
+        leaving = np.append(leaving, rows[variable[rows] & nonlinear])
+        variable[leaving], since[leaving], variable[new] = False, age - track, True  # full
         linearised = self.linearised.copy()
         linearised[new] = self.position[new]
-        return replace(self, since=since, linearised=linearised)
+        return replace(self, since=since, variable=variable, linearised=linearised)
 
     def solved(self, serials: IdArray, points: Array, linearised: Array) -> Self:
         """With variables (V,), by serial number, at points (V, 3), and where the graph has them linearised (V, 3)."""
@@ -131,9 +137,9 @@ class SmootherLandmarks(LandmarkRows):
         position[rows], at[rows] = points, linearised
         return replace(self, position=position, linearised=at)
 
-    def without_variables(self, age: int) -> Self:
-        """With smart factors that begin at an age in place of all variables."""
-        return replace(self, since=np.where(self.since == VARIABLE, age, self.since))
+    def without_variables(self) -> Self:
+        """With smart factors in place of all variables."""
+        return replace(self, variable=np.zeros(len(self), bool))
 
     def left_behind(self, rows: IndexArray, T: Array, drift: Array) -> Self:
         """After a pose T (4, 4) that measured only the landmarks `rows`, and is off by a drift (6, 6) from the last."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from slam.geometry.arrays import Table
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 from slam.window.motion import LONGEST, predicted
+from slam.window.stereo import RectifiedStereo
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,7 @@ class SmootherState:
     left_stamps: Array = field(default_factory=lambda: np.zeros(0))  # times of poses that are kept no more (N,) [s]
     left_poses: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # and these, in no order
     measured: bool = False  # whether the newest pose may not be updated any more
-    revisions: int = 0  # how often the measurements were revised
+    revisions: int = 0  # how often a new graph was needed: measurements revised, landmarks first known in the world
     contradicted: int = 0  # updates in succession in which most observations agreed on another pose than expected
 
     @classmethod
@@ -133,6 +134,17 @@ class SmootherState:
         if lag is None:
             return least
         return max(least, self.first + int(np.searchsorted(self.ages, self.ages[self.of(newest)] - lag)))
+
+    def corrected(self, correct: Callable[[Array], Array]) -> SmootherState:
+        """With corrected measurements; MeasurementError if one is not finite."""
+
+        def again(z: Array) -> Array:
+            return RectifiedStereo.corrected("smoother", z, correct) if len(z) else z
+
+        z, there = self.landmarks.z.copy(), self.landmarks.pose >= 0
+        z[there] = again(z[there])
+        sights = tuple(replace(sight, z=again(sight.z)) for sight in self.sights)
+        return replace(self, sights=sights, landmarks=replace(self.landmarks, z=z), revisions=self.revisions + 1)
 
     def without_old(self, past: int, lag: int) -> SmootherState:
         """Without what is kept of all but the last `past` poses before those that are smoothed."""

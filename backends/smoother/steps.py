@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,8 +11,7 @@ import numpy as np
 from backends.smoother import joint
 from backends.smoother.config import SmootherConfig
 from backends.smoother.graph import Graph, Solved, SolverError
-from backends.smoother.landmarks import VARIABLE, SmootherLandmarks, inverses
-from backends.smoother.rig import considered
+from backends.smoother.landmarks import SmootherLandmarks, inverses
 from backends.smoother.state import Known, Sight, SmootherState
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, points_by_pose, transform
@@ -22,6 +22,7 @@ from slam.window.recovery import Agreement, agreement, unknown_turn, world_covar
 from slam.window.stereo import RectifiedMeasurement
 
 _DARK = 100  # cost: frames without a measurement after which half of them leave: they would be poses of the graph
+_AGAIN = 2  # numerics: steps of Gauss and Newton after the usual ones where measurements were corrected
 _SAME = 0.5  # share of a pose's landmarks that another one must measure to say nothing new
 
 
@@ -132,14 +133,26 @@ class Steps(RectifiedMeasurement):
         after = self._measured(after, seen, one.z, s.oldest(self.config.lag or SmootherConfig.lag, number))
         solved, why = graph.followed(after)
         after = self.settled(after, solved)
-        marks = after.landmarks.without_variables(age) if why else after.landmarks
+        marks = after.landmarks.without_variables() if why else after.landmarks
         return replace(after, landmarks=marks.left_behind(seen, after.poses[-1], solved.drift)), nis, why
 
     def _considered(self, s: SmootherState, one: pose_only.PoseProblem, T: Array, seen: IndexArray) -> SmootherState:
-        """With derivatives by errors of the rig after measurements, which put the newest pose at T (4, 4)."""
-        marks, sigma = s.landmarks, self.models.pixel_sigma
+        """With derivatives by errors of the rig after measurements, which put the newest pose at T (4, 4).
+
+        The errors are considered, not estimated (Schmidt, 1966). The pose follows from the landmarks as they stand, and
+        each landmark from its measurements given the poses: these gains move the derivatives by the errors, too.
+        """
+        marks, pose = s.landmarks, s.by_rig[6:]
         own, by_rig = marks.from_newest[seen], marks.by_rig.copy()
-        pose, by_rig[seen] = considered(one, T, s.by_rig[6:], by_rig[seen], self.field(one.z), own, sigma)
+        local = (one.points - T[:3, 3]) @ T[:3, :3]
+        D = self.stereo.project(local)[1]
+        D[np.isnan(one.z[:, 2]), 2] = 0.0
+        G, H = D @ points_by_pose(local), D @ T[:3, :3].T  # measurements by pose and landmarks
+        rest = np.nan_to_num(self.field(one.z)) - H @ by_rig[seen]
+        A, b = ((one.whiteners @ M).reshape(3 * len(M), M.shape[2]) for M in (G, rest))
+        pose = np.linalg.solve(one.information + A.T @ A, one.information @ pose + A.T @ b)
+        S = H @ own @ np.swapaxes(H, 1, 2) + self.models.pixel_sigma**2 * np.eye(3)
+        by_rig[seen] += own @ np.swapaxes(H, 1, 2) @ np.linalg.inv(S) @ (rest - G @ pose)
         before = s.by_rig[:6] + s.gain @ (pose - s.by_rig[6:])
         return replace(s, by_rig=np.concatenate([before, pose]), landmarks=replace(marks, by_rig=by_rig))
 
@@ -180,6 +193,25 @@ class Steps(RectifiedMeasurement):
         grown = lag is not None and len(s.poses) >= 1.5 * (lag + 1 + self.config.past)
         return s.without_old(self.config.past, lag) if lag is not None and grown else s
 
+    def revised(self, s: SmootherState, graph: Graph, correct: Callable[[Array], Array]) -> SmootherState:
+        """After a correction of the measurements; unless landmarks are known in the world, the newest pose stays.
+
+        Raises MeasurementError where a corrected measurement is not finite.
+        """
+        s = _anchored(s.corrected(correct))
+        marks, oldest = s.landmarks, s.oldest(self.config.lag, s.number)
+        try:
+            solved = graph.rebuilt(s, _AGAIN, hold=not s.fixed)
+        except SolverError:  # the next update tries again
+            return replace(s, landmarks=marks.refined(self.stereo, self.models.pixel_sigma, s.first, s.poses))
+        D = solved.poses[0] @ inverse(s.poses[s.of(oldest)])
+        unseen = ~marks.world & ~(marks.pose >= oldest).any(axis=1)
+        position = np.where(unseen[:, None], transform(D, marks.position), marks.position)
+        marks = replace(marks, position=position, mean=np.where(unseen[:, None], position, marks.mean))
+        poses = np.concatenate([D @ s.poses[: s.of(oldest)], s.poses[s.of(oldest) :]])
+        start = graph.to_state @ s.start
+        return self.settled(replace(s, poses=poses, left_poses=D @ s.left_poses, start=start, landmarks=marks), solved)
+
     # --- landmarks ---
 
     def added(self, s: SmootherState, ids: IdArray, z: Array) -> SmootherState:
@@ -188,7 +220,7 @@ class Steps(RectifiedMeasurement):
         Raises MeasurementError where one is in the map already, or has no right pixel or no positive depth.
         """
         s.landmarks.require_new(ids)
-        s, rows = anchored(s), len(s.landmarks) + np.arange(len(ids))
+        s, rows = _anchored(s), len(s.landmarks) + np.arange(len(ids))
         marks = _seen_from_newest(s, ids, *self.first_sight(ids, z))
         s = _with(s, replace(marks, information=np.zeros_like(marks.information)))
         return self._measured(s, rows, z, 0)
@@ -198,11 +230,12 @@ class Steps(RectifiedMeasurement):
         none = np.zeros((len(ids), 3, s.by_rig.shape[1]))
         marks = SmootherLandmarks.of(ids, s.serials, positions, covariances, inverses(covariances), True, none)
         known = {serial: Known(x, P, -1) for serial, x, P in zip(marks.serial.tolist(), positions, covariances)}
+        s = replace(s, revisions=s.revisions + (not s.fixed))
         return replace(_with(s, marks), known={**s.known, **known}, measured=s.measured)
 
     def placed(self, s: SmootherState, ids: IdArray, local: Array, covariances: Array) -> SmootherState:
         """With landmarks known in the newest camera's coordinates; see `slam.interfaces.MapBackend.place`."""
-        s = anchored(s)
+        s = _anchored(s)
         marks = _seen_from_newest(s, ids, local, covariances, np.zeros((len(ids), 3, s.by_rig.shape[1])))
         known = {n: Known(x, P, s.number) for n, x, P in zip(marks.serial.tolist(), local, covariances)}
         return replace(_with(s, marks), known={**s.known, **known})
@@ -220,7 +253,7 @@ class Steps(RectifiedMeasurement):
         """Covariances (M, 3, 3) of landmarks in the world."""
         marks, end = s.landmarks, s.of(s.anchor) + 1
         C = marks.covariances(rows, s.anchor, s.poses[:end], s.spread[:end])
-        for i in np.flatnonzero(marks.since[rows] == VARIABLE):
+        for i in np.flatnonzero(marks.variable[rows]):
             found = graph.landmark_covariance(s, int(marks.serial[rows[i]]), marks.position[rows[i]])
             C[i] = C[i] if found is None else found
         return C
@@ -236,10 +269,10 @@ def _begun(s: SmootherState, T: Array, P: Array) -> SmootherState:
 
     Landmarks go on as they stand; what they were measured from is no part of it.
     """
-    marks = s.landmarks.without_measurements(np.ones(len(s.landmarks), bool)).without_variables(int(s.ages[-1]))
+    marks = s.landmarks.without_measurements(np.ones(len(s.landmarks), bool)).without_variables()
     return replace(
         s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread[:-1], P[None]]),
-        joint=joint.alone(P), prior=P, start=T, begun=s.number, anchor=s.number, landmarks=marks,
+        joint=np.pad(P, (0, 12)), prior=P, start=T, begun=s.number, anchor=s.number, landmarks=marks,
         known={serial: one for serial, one in s.known.items() if one.pose < 0},
     )  # fmt: skip
 
@@ -258,25 +291,20 @@ def _alone(s: SmootherState, T: Array, information: Array) -> SmootherState:
     return replace(s, poses=poses, spread=np.concatenate([s.spread[:-1], P[None]]))
 
 
-def anchored(s: SmootherState) -> SmootherState:
-    """With the newest pose as the anchor, where it is predicted if nothing was measured.
+def _anchored(s: SmootherState) -> SmootherState:
+    """With the newest pose as the anchor, where it is predicted if nothing was measured; landmarks are relative to it.
 
     Nothing but the motion ties it to the last: where it may have turned anyhow, the problem begins anew. The motion's
     covariance, which is linear in the turn, is of no direction then.
     """
     if s.anchor == s.number:
         return s
-    s = _left_behind(s)
+    s = replace(_seeing(s), landmarks=s.landmarks.left_behind(np.zeros(0, np.intp), s.poses[-1], s.relative))
     if unknown_turn(s.relative):
         largest = [np.linalg.eigvalsh(s.spread[-1][part, part]).max() for part in (slice(3), slice(3, 6))]
         return _begun(s, s.poses[-1], 2 * np.diag(np.repeat(largest, 3)))
     by_anchor = adjoint(inverse(s.poses[-1]) @ s.poses[s.of(s.anchor)])
     return replace(s, joint=joint.anchored(s.joint, by_anchor, s.poses[-2:]), anchor=s.number)
-
-
-def _left_behind(s: SmootherState) -> SmootherState:
-    """With the newest pose as one that saw something, and landmarks relative to it though it measured none."""
-    return replace(_seeing(s), landmarks=s.landmarks.left_behind(np.zeros(0, np.intp), s.poses[-1], s.relative))
 
 
 def _seeing(s: SmootherState) -> SmootherState:
