@@ -72,9 +72,8 @@ class SmootherBackend:
         require_stamp("smoother", stamp, float(s.stamps[-1]) if s.started else None)
         s = self._steps.predicted(s, float(stamp), rests)
         rows, left, right, S = self._steps.in_view(s)
-        found = Prediction(float(stamp), s.poses[-1].copy(), s.spread[-1].copy(), s.landmarks.ids[rows], left, right, S)
-        self.state = s
-        return found
+        self.state, T, P = s, s.poses[-1].copy(), s.covariances[-1].copy()
+        return Prediction(float(stamp), T, P, s.landmarks.ids[rows], left, right, S)
 
     @one_blas_thread
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
@@ -106,7 +105,7 @@ class SmootherBackend:
         marks = s.landmarks
         rows = marks.order if landmarks else marks.order[:0]
         covariances = self.landmark_covariances(rows)
-        T, P = s.poses[-1].copy(), s.spread[-1].copy()
+        T, P = s.poses[-1].copy(), s.covariances[-1].copy()
         return Estimate(float(s.stamps[-1]), T, P, marks.ids[rows], marks.position[rows], covariances)
 
     def positions(self, ids: IdArray) -> Array:

@@ -27,14 +27,6 @@ def to_pose3(T: Array) -> gtsam.Pose3:
     return gtsam.Pose3(gtsam.Rot3(nearest_rotation(T[:3, :3])), T[:3, 3])
 
 
-def _parameters(silent: bool) -> gtsam.SmartProjectionParams:
-    parameters = gtsam.SmartProjectionParams()
-    parameters.setLinearizationMode(gtsam.LinearizationMode.HESSIAN)
-    if silent:
-        parameters.setDegeneracyMode(gtsam.DegeneracyMode.ZERO_ON_DEGENERACY)
-    return parameters
-
-
 class FactorMaker:
     """Makes factors for one rig and one set of models: of poses X(number) and landmarks L(serial number).
 
@@ -50,7 +42,8 @@ class FactorMaker:
         self._noise = gtsam.noiseModel.Isotropic.Sigma(3, self.sigma)
         self._K_left = gtsam.Cal3_S2(stereo.f, stereo.f, 0.0, stereo.u0, stereo.v0)
         self._noise_left = gtsam.noiseModel.Isotropic.Sigma(2, self.sigma)
-        self._strict, self._silent = _parameters(False), _parameters(True)
+        self._strict, self._silent = gtsam.SmartProjectionParams(), gtsam.SmartProjectionParams()
+        self._silent.setDegeneracyMode(gtsam.DegeneracyMode.ZERO_ON_DEGENERACY)
 
     def prior(self, pose: int, T: Array, covariance: Array) -> gtsam.NonlinearFactor:
         """A pose is T (4, 4) with a covariance (6, 6)."""
@@ -132,7 +125,7 @@ class GraphUpdate:
     to_graph: Array = field(default_factory=lambda: np.eye(4))  # takes the state's coordinates to gtsam's
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     values: gtsam.Values = field(default_factory=gtsam.Values)
-    timestamps: dict[Any, float] = field(default_factory=dict)  # of variables, for the fixed lag: `SmootherState.ages`
+    timestamps: dict[Any, float] = field(default_factory=dict)  # of variables, for the fixed lag: `SmootherState.ticks`
     removed: list[int] = field(default_factory=list)  # slots of factors that others replace
 
     def add_pose(self, s: SmootherState, number: int, oldest: int) -> None:
@@ -140,7 +133,7 @@ class GraphUpdate:
         if number > oldest:
             self.factors.add(self._motion(s, number, oldest))
         self.values.insert(X(number), to_pose3(self.to_graph @ s.poses[s.of(number)]))
-        self.timestamps[X(number)] = float(s.ages[s.of(number)])
+        self.timestamps[X(number)] = float(s.ticks[s.of(number)])
 
     def _motion(self, s: SmootherState, number: int, oldest: int) -> gtsam.NonlinearFactor:
         """What the motion model says of a pose: its velocity is that between the two poses before, but for noise.

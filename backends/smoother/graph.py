@@ -53,7 +53,7 @@ class Solved:
     # By how much (6, 6) the last pose is less certain than the anchor before it: over many frames this adds up to the
     # path's drift. The covariance of the motion would not, as each frame has an error of its own that the next forgets.
     drift: Array
-    spread: Array  # covariances (N, 6, 6) of those that are new
+    covariances: Array  # covariances (N, 6, 6) of those that are new
 
 
 class Graph:
@@ -80,21 +80,21 @@ class Graph:
         self.to_state = np.eye(4)
         self._careful = 0  # number of the first pose whose factors may throw again, after a failure
 
-    def followed(self, s: SmootherState) -> tuple[Solved, str]:
+    def update(self, s: SmootherState) -> tuple[Solved, str]:
         """The solution for a state with more poses than the last one; and why gtsam failed, if it did.
 
         After a failure there are no landmarks among its variables. Raises SolverError where gtsam fails with the new
         graph as well.
         """
         if not self._is_of(s):
-            return self.rebuilt(s), ""
+            return self.rebuild(s), ""
         try:
-            return self._update(s, GraphUpdate(self._make, inverse(self.to_state))), ""
+            return self._solve(s, GraphUpdate(self._make, inverse(self.to_state))), ""
         except SolverError as error:
             self._careful = s.number + _CAREFUL
-            return self.rebuilt(replace(s, landmarks=s.landmarks.without_variables())), str(error)
+            return self.rebuild(replace(s, landmarks=s.landmarks.without_variables())), str(error)
 
-    def rebuilt(self, s: SmootherState, steps: int = 0, hold: bool = False) -> Solved:
+    def rebuild(self, s: SmootherState, steps: int = 0, hold: bool = False) -> Solved:
         """The solution with all anew, after so many `steps` more than usual; SolverError where gtsam fails.
 
         Where `hold` says so, all moves as a whole so that the newest pose stays.
@@ -114,9 +114,9 @@ class Graph:
         prior, self._base = first_prior(s, oldest)
         update = GraphUpdate(self._make)
         update.factors.add(self._make.prior(oldest, s.start if oldest == s.begun else self._start, prior))
-        return self._update(s, update, steps, hold)
+        return self._solve(s, update, steps, hold)
 
-    def _update(self, s: SmootherState, update: GraphUpdate, steps: int = 0, hold: bool = False) -> Solved:
+    def _solve(self, s: SmootherState, update: GraphUpdate, steps: int = 0, hold: bool = False) -> Solved:
         """The solution with what is in an update, the poses that the graph lacks, and what was measured from them."""
         last, self.number = self.number, -1  # until it is done: an interrupted call leaves a graph unknown
         oldest = s.oldest(self._lag, s.number)
@@ -158,15 +158,15 @@ class Graph:
         if not (np.isfinite(poses).all() and np.isfinite(P).all() and (np.diag(P) > 0).all()):
             raise SolverError("gtsam: the solution is not finite, or a variance not positive")
         new = range(max(oldest, s.solved + 1), s.number)
-        spread = np.array(
+        covariances = np.array(
             [*(self._covariance([i], poses[[i - oldest]]) for i in new), P[12:, 12:] + self._rigid(newest[None])]
         )
         shared = joint.anchored(P, np.zeros((6, 6)), np.array([before, newest]))
-        shared[:6, :6] = spread[-1]
+        shared[:6, :6] = covariances[-1]
         A = adjoint(inverse(newest) @ anchor)
         drift = joint.root(P[12:, 12:] - A @ P[:6, :6] @ A.T)
         self.number = s.number
-        return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, shared, drift @ drift.T, spread)
+        return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, shared, drift @ drift.T, covariances)
 
     def joint_covariance(self, s: SmootherState, first: int) -> tuple[int, Array]:
         """Number of the first pose, and the joint covariance (6 K, 6 K) of the poses from there to the newest.
@@ -175,7 +175,7 @@ class Graph:
         Poses that are not in the graph yet follow from the motion model.
         """
         if not self._is_of(s):
-            return s.number, s.spread[-1]
+            return s.number, s.covariances[-1]
         oldest = s.oldest(self._lag, self.number)
         first = max(oldest, first)
         begin = max(oldest, min(first, self.number - 1))  # where the motion goes on, it needs two poses
@@ -187,7 +187,7 @@ class Graph:
             own = cross[:, -J.shape[1] :] @ J.T + noise
             P = np.block([[P, cross.T], [cross, 0.5 * (own + own.T)]])  # what is not symmetric would grow fourfold
             gain = np.linalg.solve(P[-6:, -6:], P[-6:])  # a pose that was solved for alone is known better
-            P = P + gain.T @ (s.spread[s.of(number)] - P[-6:, -6:]) @ gain
+            P = P + gain.T @ (s.covariances[s.of(number)] - P[-6:, -6:]) @ gain
         rows = slice(6 * (first - begin), None)
         return first, P[rows, rows]
 
@@ -230,7 +230,7 @@ def first_prior(s: SmootherState, number: int) -> tuple[Array, Array]:
     What was measured from the pose with which the problem begins is in the graph, and not in its prior. Of a later one
     it is in both; but what known landmarks told of it is not told again, see `Tracks`.
     """
-    P = s.prior if number == s.begun else s.spread[s.of(number)]
+    P = s.prior if number == s.begun else s.covariances[s.of(number)]
     if s.fixed:
         return P, np.zeros((6, 6))
     prior = np.diag(np.minimum(np.diag(P), _FIRM))

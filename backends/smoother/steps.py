@@ -51,13 +51,13 @@ class Steps(RectifiedMeasurement):
             T = self.models.initial_pose
             sigmas = np.repeat([self.models.initial_rotation_sigma, self.models.initial_position_sigma], 3)
             P: Array = np.diag(sigmas**2)
-            return _begun(replace(s, poses=T[None], spread=P[None], ages=np.zeros(1, np.intp)), T, P)
+            return _begun(replace(s, poses=T[None], covariances=P[None], ticks=np.zeros(1, np.intp)), T, P)
         T, J, noise, _ = s.moved(self.models, s.number + 1)
         P = joint.moved(s.joint, J, noise)
-        spread = joint.in_world(P, s.poses[s.of(s.anchor)], T)
+        covariances = np.concatenate([s.covariances, joint.in_world(P, s.poses[s.of(s.anchor)], T)[None]])
         return replace(
-            s, poses=np.concatenate([s.poses, T[None]]), ages=np.append(s.ages, s.ages[-1]), joint=P,
-            spread=np.concatenate([s.spread, spread[None]]), by_rig=np.concatenate([s.by_rig[6:], J @ s.by_rig]),
+            s, poses=np.concatenate([s.poses, T[None]]), ticks=np.append(s.ticks, s.ticks[-1]), joint=P,
+            covariances=covariances, by_rig=np.concatenate([s.by_rig[6:], J @ s.by_rig]),
         )  # fmt: skip
 
     def in_view(self, s: SmootherState) -> tuple[IndexArray, Array, Array, Array]:
@@ -66,7 +66,7 @@ class Steps(RectifiedMeasurement):
         rows = rows[self.visible(T, marks.position[rows])]
         local, own = pose_only.seen_from(T, marks.position[rows], marks.from_newest[rows])
         by_pose = points_by_pose(local)
-        by_motion = np.where(marks.world[rows, None, None], s.spread[-1], s.relative)
+        by_motion = np.where(marks.world[rows, None, None], s.covariances[-1], s.relative)
         C = own + by_pose @ by_motion @ np.swapaxes(by_pose, 1, 2)
         return rows, *self.pixels(local, C)
 
@@ -82,7 +82,7 @@ class Steps(RectifiedMeasurement):
         try:
             one = self._problem(s, rows, z)
             at, start = s.of(s.anchor), one.predicted if guess is None else guess
-            since = _attitude(s.poses[at], s.spread[at]) - _attitude(s.start, s.prior)  # since the problem began
+            since = _attitude(s.poses[at], s.covariances[at]) - _attitude(s.start, s.prior)  # since the problem began
             lost = len(s.sights[at]) >= MIN_CONSENSUS and unknown_turn(since)
             found = agreement(
                 one, start, lambda: landmarks_pose(self, one.points, z, one.predicted, s.number), s.contradicted, lost
@@ -104,7 +104,7 @@ class Steps(RectifiedMeasurement):
         T, marks = s.poses[-1], s.landmarks
         local, own = pose_only.seen_from(T, marks.position[rows], marks.from_newest[rows])
         noise = pose_only.residual_noise(self.stereo, self.models.pixel_sigma, local, own, z)
-        P = s.spread[-1] if s.anchor == s.number or marks.world[rows].any() else s.relative
+        P = s.covariances[-1] if s.anchor == s.number or marks.world[rows].any() else s.relative
         probability = self.models.gate_probability
         return pose_only.PoseProblem(self.stereo, marks.position[rows], z, noise, T, np.linalg.inv(P), probability)
 
@@ -115,7 +115,7 @@ class Steps(RectifiedMeasurement):
         used, marks = found.used, s.landmarks
         seen, number = rows[used], s.number
         if found.jump is not None:
-            return self._anew(s, graph, found.T, world_covariance(s.spread[-1]), seen, z[used])
+            return self._anew(s, graph, found.T, world_covariance(s.covariances[-1]), seen, z[used])
         one = replace(one, points=one.points[used], z=z[used], noise=one.noise[used])
         x = log(inverse(one.predicted) @ found.T)
         nis = float(one.distances(found.T).sum() + x @ one.information @ x)
@@ -127,12 +127,12 @@ class Steps(RectifiedMeasurement):
                 return _alone(s, found.T, information), nis, ""
         ratio = math.sqrt(self.stereo.f / self.models.pixel_sigma)
         after = replace(_seeing(s), poses=np.concatenate([s.poses[:-1], found.T[None]]))
-        last, age = s.age(marks.pose.max(axis=1, initial=-1)), int(after.ages[-1])
-        marks = s.landmarks.with_variables(seen, last, one.z, age, self.track, self.config.landmarks, found.T, ratio)
+        last, tick = s.tick(marks.pose.max(axis=1, initial=-1)), int(after.ticks[-1])
+        marks = s.landmarks.with_variables(seen, last, one.z, tick, self.track, self.config.landmarks, found.T, ratio)
         after = replace(after, landmarks=marks)
         after = self._measured(after, seen, one.z, s.oldest(self.config.lag or SmootherConfig.lag, number))
-        solved, why = graph.followed(after)
-        after = self.settled(after, solved)
+        solved, why = graph.update(after)
+        after = self._settled(after, solved)
         marks = after.landmarks.without_variables() if why else after.landmarks
         return replace(after, landmarks=marks.left_behind(seen, after.poses[-1], solved.drift)), nis, why
 
@@ -161,12 +161,12 @@ class Steps(RectifiedMeasurement):
     ) -> tuple[SmootherState, float, str]:
         """As `_corrected`, with the newest pose, at T (4, 4) with a covariance P (6, 6), as the first of a problem."""
         s = self._measured(_begun(_seeing(s), T, P), seen, z, s.number)
-        return self.settled(s, graph.rebuilt(s)), float("nan"), ""
+        return self._settled(s, graph.rebuild(s)), float("nan"), ""
 
     def _measured(self, s: SmootherState, rows: IndexArray, z: Array, oldest: int) -> SmootherState:
         """With measurements z (M, 3) of landmarks from the newest pose; see `SmootherLandmarks.measured`."""
-        marks, age = s.landmarks, int(s.ages[-1])
-        since = marks.spans(rows, s.age(marks.pose[rows].max(axis=1)), age, self.track, int(s.age(s.solved)))
+        marks, tick = s.landmarks, int(s.ticks[-1])
+        since = marks.spans(rows, s.tick(marks.pose[rows].max(axis=1)), tick, self.track, int(s.tick(s.solved)))
         marks = marks.measured(rows, z, s.number, since, oldest)
         sight = s.sights[-1].joined(Sight(marks.serial[rows], since, z))
         return replace(s, landmarks=marks, sights=(*s.sights[:-1], sight))
@@ -177,21 +177,20 @@ class Steps(RectifiedMeasurement):
         last = s.sights[s.of(s.solved)].serials if near else serials[:0]
         return bool(np.isin(last, serials).sum() > _SAME * len(last))
 
-    def settled(self, s: SmootherState, solved: Solved) -> SmootherState:
+    def _settled(self, s: SmootherState, solved: Solved) -> SmootherState:
         """The state with what the graph says: the newest pose is the anchor."""
         poses = np.concatenate([s.poses[: s.of(solved.oldest)], solved.poses])
-        spread = np.concatenate([s.spread[: -len(solved.spread)], solved.spread])
+        covariances = np.concatenate([s.covariances[: -len(solved.covariances)], solved.covariances])
         marks = s.landmarks.refined(self.stereo, self.models.pixel_sigma, s.first, poses)
         marks = marks.solved(solved.serials, solved.points, solved.linearised)
         known = {n: s.known[n] for n in s.sights[-1].serials.tolist() if n in s.known and s.known[n].used < 0}
         used = {n: replace(one, used=s.number) for n, one in known.items()}
         s = replace(
-            s, poses=poses, joint=solved.joint, spread=spread, landmarks=marks, anchor=s.number, solved=s.number,
-            known={**s.known, **used} if used else s.known,
+            s, poses=poses, joint=solved.joint, covariances=covariances, landmarks=marks,
+            anchor=s.number, solved=s.number, known={**s.known, **used} if used else s.known,
         )  # fmt: skip
-        lag = self.config.lag
-        grown = lag is not None and len(s.poses) >= 1.5 * (lag + 1 + self.config.past)
-        return s.without_old(self.config.past, lag) if lag is not None and grown else s
+        lag, past = self.config.lag, self.config.past
+        return s if lag is None or len(s.poses) < 1.5 * (lag + 1 + past) else s.without_old(past, lag)
 
     def revised(self, s: SmootherState, graph: Graph, correct: Callable[[Array], Array]) -> SmootherState:
         """After a correction of the measurements; unless landmarks are known in the world, the newest pose stays.
@@ -201,7 +200,7 @@ class Steps(RectifiedMeasurement):
         s = _anchored(s.corrected(correct))
         marks, oldest = s.landmarks, s.oldest(self.config.lag, s.number)
         try:
-            solved = graph.rebuilt(s, _AGAIN, hold=not s.fixed)
+            solved = graph.rebuild(s, _AGAIN, hold=not s.fixed)
         except SolverError:  # the next update tries again
             return replace(s, landmarks=marks.refined(self.stereo, self.models.pixel_sigma, s.first, s.poses))
         D = solved.poses[0] @ inverse(s.poses[s.of(oldest)])
@@ -210,7 +209,7 @@ class Steps(RectifiedMeasurement):
         marks = replace(marks, position=position, mean=np.where(unseen[:, None], position, marks.mean))
         poses = np.concatenate([D @ s.poses[: s.of(oldest)], s.poses[s.of(oldest) :]])
         start = graph.to_state @ s.start
-        return self.settled(replace(s, poses=poses, left_poses=D @ s.left_poses, start=start, landmarks=marks), solved)
+        return self._settled(replace(s, poses=poses, left_poses=D @ s.left_poses, start=start, landmarks=marks), solved)
 
     # --- landmarks ---
 
@@ -252,7 +251,7 @@ class Steps(RectifiedMeasurement):
     def landmark_covariances(self, s: SmootherState, graph: Graph, rows: IndexArray) -> Array:
         """Covariances (M, 3, 3) of landmarks in the world."""
         marks, end = s.landmarks, s.of(s.anchor) + 1
-        C = marks.covariances(rows, s.anchor, s.poses[:end], s.spread[:end])
+        C = marks.covariances(rows, s.anchor, s.poses[:end], s.covariances[:end])
         for i in np.flatnonzero(marks.variable[rows]):
             found = graph.landmark_covariance(s, int(marks.serial[rows[i]]), marks.position[rows[i]])
             C[i] = C[i] if found is None else found
@@ -271,7 +270,7 @@ def _begun(s: SmootherState, T: Array, P: Array) -> SmootherState:
     """
     marks = s.landmarks.without_measurements(np.ones(len(s.landmarks), bool)).without_variables()
     return replace(
-        s, poses=np.concatenate([s.poses[:-1], T[None]]), spread=np.concatenate([s.spread[:-1], P[None]]),
+        s, poses=np.concatenate([s.poses[:-1], T[None]]), covariances=np.concatenate([s.covariances[:-1], P[None]]),
         joint=np.pad(P, (0, 12)), prior=P, start=T, begun=s.number, anchor=s.number, landmarks=marks,
         known={serial: one for serial, one in s.known.items() if one.pose < 0},
     )  # fmt: skip
@@ -288,7 +287,7 @@ def _alone(s: SmootherState, T: Array, information: Array) -> SmootherState:
     earlier = s.poses[-2] @ exp(s.gain @ log(inverse(s.poses[-1]) @ T))
     P = joint.in_world(s.joint - s.joint[:, 12:] @ less @ s.joint[12:], s.poses[s.of(s.anchor)], T)
     poses = np.concatenate([s.poses[:-2], earlier[None], T[None]])
-    return replace(s, poses=poses, spread=np.concatenate([s.spread[:-1], P[None]]))
+    return replace(s, poses=poses, covariances=np.concatenate([s.covariances[:-1], P[None]]))
 
 
 def _anchored(s: SmootherState) -> SmootherState:
@@ -301,7 +300,7 @@ def _anchored(s: SmootherState) -> SmootherState:
         return s
     s = replace(_seeing(s), landmarks=s.landmarks.left_behind(np.zeros(0, np.intp), s.poses[-1], s.relative))
     if unknown_turn(s.relative):
-        largest = [np.linalg.eigvalsh(s.spread[-1][part, part]).max() for part in (slice(3), slice(3, 6))]
+        largest = [np.linalg.eigvalsh(s.covariances[-1][part, part]).max() for part in (slice(3), slice(3, 6))]
         return _begun(s, s.poses[-1], 2 * np.diag(np.repeat(largest, 3)))
     by_anchor = adjoint(inverse(s.poses[-1]) @ s.poses[s.of(s.anchor)])
     return replace(s, joint=joint.anchored(s.joint, by_anchor, s.poses[-2:]), anchor=s.number)
@@ -309,7 +308,7 @@ def _anchored(s: SmootherState) -> SmootherState:
 
 def _seeing(s: SmootherState) -> SmootherState:
     """With the newest pose as one that saw something."""
-    return replace(s, ages=np.append(s.ages[:-1], s.ages[-2:][0] + 1))
+    return replace(s, ticks=np.append(s.ticks[:-1], s.ticks[-2:][0] + 1))
 
 
 def _with(s: SmootherState, marks: SmootherLandmarks) -> SmootherState:

@@ -93,7 +93,7 @@ class Tracks:
     def _stays(self, update: GraphUpdate, s: SmootherState, serial: int, number: int) -> None:
         """A variable stays for as long as a pose."""
         self._variables[serial] = number
-        update.timestamps[L(serial)] = float(s.ages[s.of(number)])
+        update.timestamps[L(serial)] = float(s.ticks[s.of(number)])
 
     def _turn(self, update: GraphUpdate, serial: int, position: Array) -> None:
         """A landmark at a position (3,) becomes a variable, with the measurements of its smart factor."""
