@@ -83,13 +83,12 @@ class Graph:
     def update(self, s: SmootherState) -> tuple[Solved, str]:
         """The solution for a state with more poses than the last one; and why gtsam failed, if it did.
 
-        After a failure there are no landmarks among its variables. Raises SolverError where gtsam fails with the new
-        graph as well.
+        After a failure there are no landmarks among its variables. Raises SolverError where gtsam fails again.
         """
-        if not self._is_of(s):
-            return self.rebuild(s), ""
         try:
-            return self._solve(s, GraphUpdate(self._make, inverse(self.to_state))), ""
+            if self._is_of(s):
+                return self._solve(s, GraphUpdate(self._make, inverse(self.to_state))), ""
+            return self.rebuild(s), ""
         except SolverError as error:
             self._careful = s.number + _CAREFUL
             return self.rebuild(replace(s, landmarks=s.landmarks.without_variables())), str(error)
