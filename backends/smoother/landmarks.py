@@ -31,7 +31,7 @@ class SmootherLandmarks(LandmarkRows):
     z: Array  # its last measurements (S, RECENT, 3)
     pose: IndexArray  # and the numbers of their poses (S, RECENT), −1 for none
     since: IndexArray  # tick (`SmootherState.ticks`) from which the span of its smart factor counts (S,)
-    variable: BoolArray  # whether it is a variable of the graph instead (S,); not of those that are known beforehand
+    variable: BoolArray  # whether it stays a variable of the graph instead (S,); known ones begin as variables anyway
     linearised: Array  # where the graph has it linearised, if it is a variable (S, 3) [m]
     by_rig: Array  # derivatives of the positions by errors of the rig (S, 3, m)
 

@@ -34,7 +34,7 @@ class Tracks:
     variable, and so are those that are in the state: these take over the measurements of their smart factor.
 
     A factor begins at most `track` poses before the newest one, which is no more than the lag and one (`Steps.track`):
-    so it ends before its first pose leaves, and with it what gtsam marginalises the factor into.
+    it takes no measurement any more when its first pose has left, and gtsam has marginalised it.
     """
 
     def __init__(self, make: FactorMaker) -> None:
@@ -69,7 +69,7 @@ class Tracks:
             track.far = track.far or z[0] - z[2] < make.far
             self._grown[serial, track.poses[0]] = track
             if serial in variables and track.stereo:
-                self._turn(update, serial, variables[serial])
+                self._make_variable(update, serial, variables[serial])
                 self._stays(update, s, serial, number)
 
     def keep(self, update: GraphUpdate, s: SmootherState) -> list[int]:
@@ -95,7 +95,7 @@ class Tracks:
         self._variables[serial] = number
         update.timestamps[L(serial)] = float(s.ticks[s.of(number)])
 
-    def _turn(self, update: GraphUpdate, serial: int, position: Array) -> None:
+    def _make_variable(self, update: GraphUpdate, serial: int, position: Array) -> None:
         """A landmark at a position (3,) becomes a variable, with the measurements of its smart factor."""
         track = self._smart.pop(serial)
         del self._grown[serial, track.poses[0]]

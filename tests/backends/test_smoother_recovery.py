@@ -126,11 +126,11 @@ def test_a_graph_that_cannot_be_built_with_landmarks_as_variables_is_built_witho
         step(backend, stamp, seen, known)
     assert backend.state.landmarks.variable.any()
 
-    def turn(*_):
+    def fail(*_):
         raise SolverError("gtsam: Indeterminant linear system")
 
     with monkeypatch.context() as patched:
-        patched.setattr("backends.smoother.tracks.Tracks._turn", turn)
+        patched.setattr("backends.smoother.tracks.Tracks._make_variable", fail)
         backend.revise(lambda z: z)
         reports = [step(backend, stamp, seen, known) for stamp, _, seen in list(data)[50:]]
     assert all(report.status is UpdateStatus.OK for report in reports), reports[0].reason
