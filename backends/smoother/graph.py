@@ -73,10 +73,8 @@ class Graph:
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:
         self._make, self._lag = make, lag
-        self.number, self._taken = (
-            -1,
-            0,
-        )  # and how many rows of that pose are in it: landmarks are added after an update
+        self.number = -1
+        self._taken = 0  # rows of that pose that are in it: landmarks are added after an update
         self.to_state = np.eye(4)
         self._careful = 0  # number of the first pose whose factors may throw again, after a failure
 
