@@ -13,13 +13,13 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import L, X
 
 from backends.smoother import SmootherBackend
-from backends.smoother.factors import landmark_key, pose_key
-from backends.smoother.graph import SolverError, first_prior, minimised, solving
+from backends.smoother.factors import GraphUpdate
+from backends.smoother.graph import SolverError, first_prior, solving
 from backends.smoother.landmarks import by_pose
 from backends.smoother.state import SmootherState
-from backends.smoother.tracks import GraphProblem, Tracks
 from slam.data import Estimate
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
@@ -106,19 +106,19 @@ class _BatchSolution:
         s, make = smoother.state, smoother.factor_maker
         self.state = s  # what it is the solution for
         numbers = range(s.begun, s.number + 1)
-        problem, tracks = GraphProblem(), Tracks(make, None)
+        problem = GraphUpdate(make)
         prior, self._base = first_prior(s, s.begun)
         problem.factors.add(make.prior(s.begun, s.start, prior))
         for number in numbers:
-            tracks.add_pose(problem, s, number, s.begun)
+            problem.add_pose(s, number, s.begun)
         places = _places(s, make.stereo, numbers)
         known = {serial for serial, one in s.known.items() if one.pose < 0 or one.pose >= s.begun}
         self.landmarks = known.union(places)  # serial numbers of those that are variables
         for serial in sorted(self.landmarks):
             if serial in known:
-                tracks.add_known(problem, s, serial)
+                problem.add_known(s, serial)
             else:
-                problem.values.insert(landmark_key(serial), places[serial])
+                problem.values.insert(L(serial), places[serial])
                 problem.factors.add(make.known(serial, places[serial], _FARTHEST**2 * np.eye(3)))
         for number in numbers:
             sight = s.sights[s.of(number)]
@@ -128,7 +128,7 @@ class _BatchSolution:
         self._factors = problem.factors
         self.values = minimised(problem, iterations=100)
         # (F, 4, 4) from its beginning on
-        self.poses = np.array([self.values.atPose3(pose_key(number)).matrix() for number in numbers])
+        self.poses = np.array([self.values.atPose3(X(number)).matrix() for number in numbers])
 
     @cached_property
     def _marginals(self) -> gtsam.Marginals:
@@ -143,11 +143,11 @@ class _BatchSolution:
         others = np.array([serial not in self.landmarks for serial in serials], bool)
         covariances[others] = smoother.landmark_covariances(rows[others])
         for row in np.flatnonzero(~others).tolist():
-            key = landmark_key(serials[row])
+            key = L(serials[row])
             positions[row] = self.values.atPoint3(key)
             covariances[row] = self.covariance(key, by_pose(self.poses[0], positions[row][None])[0])
         T = self.poses[-1].copy()
-        P = self.covariance(pose_key(s.number), adjoint(inverse(T) @ self.poses[0]))
+        P = self.covariance(X(s.number), adjoint(inverse(T) @ self.poses[0]))
         return Estimate(float(s.stamps[-1]), T, P, marks.ids[rows], positions, covariances)
 
     def covariance(self, key: int, by_first: Array) -> Array:
@@ -167,3 +167,21 @@ def _places(s: SmootherState, stereo: RectifiedStereo, numbers: range) -> dict[i
             if d > nearest.get(serial, (0.0, place))[0]:
                 nearest[serial] = d, place
     return {serial: place for serial, (_, place) in nearest.items()}
+
+
+def minimised(update: GraphUpdate, iterations: int) -> gtsam.Values:
+    """The values that fit all factors best, by Levenberg-Marquardt; SolverError if gtsam finds nothing better."""
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(iterations)
+    parameters.setRelativeErrorTol(1e-9)
+    parameters.setAbsoluteErrorTol(1e-9)
+    with solving():
+        before = update.factors.error(update.values)
+        optimizer = gtsam.LevenbergMarquardtOptimizer(update.factors, update.values, parameters)
+        values = optimizer.optimize()
+        after = update.factors.error(values)
+    if not np.isfinite(after) or after > before:
+        raise SolverError(f"Levenberg-Marquardt found no solution (error {before:.6g} to {after:.6g})")
+    if optimizer.iterations() >= iterations:
+        logging.getLogger(__name__).warning("Levenberg-Marquardt was stopped after %d iterations", iterations)
+    return values

@@ -11,7 +11,6 @@ import numpy as np
 from backends.smoother.config import SmootherConfig
 from backends.smoother.factors import FactorMaker
 from backends.smoother.graph import Graph
-from backends.smoother.mending import corrected, rebuilt
 from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
 from slam.bounds import from_options
@@ -73,9 +72,8 @@ class SmootherBackend:
         require_stamp("smoother", stamp, float(s.stamps[-1]) if s.started else None)
         s = self._steps.predicted(s, float(stamp), rests)
         rows, left, right, S = self._steps.in_view(s)
-        found = Prediction(float(stamp), s.poses[-1].copy(), s.spread[-1].copy(), s.landmarks.ids[rows], left, right, S)
-        self.state = s
-        return found
+        self.state, T, P = s, s.poses[-1].copy(), s.covariances[-1].copy()
+        return Prediction(float(stamp), T, P, s.landmarks.ids[rows], left, right, S)
 
     @one_blas_thread
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
@@ -107,7 +105,7 @@ class SmootherBackend:
         marks = s.landmarks
         rows = marks.order if landmarks else marks.order[:0]
         covariances = self.landmark_covariances(rows)
-        T, P = s.poses[-1].copy(), s.spread[-1].copy()
+        T, P = s.poses[-1].copy(), s.covariances[-1].copy()
         return Estimate(float(s.stamps[-1]), T, P, marks.ids[rows], marks.position[rows], covariances)
 
     def positions(self, ids: IdArray) -> Array:
@@ -164,7 +162,7 @@ class SmootherBackend:
         s = self._started("sensitivities")
         return s.by_rig[6:].copy(), s.landmarks.by_rig[s.landmarks.rows_of(ids)]
 
-    # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
+    # --- corrected measurements (documented in slam.interfaces.RevisingBackend) ---
 
     @property
     def revises_path(self) -> bool:
@@ -181,7 +179,7 @@ class SmootherBackend:
         """
         s = self.state
         if s.started:
-            before, s = s, rebuilt(corrected(s, correct), self._steps, self._graph)
+            before, s = s, self._steps.revised(s, self._graph, correct)
             # what the landmarks move by is none of their error: it is the last of the rig's (`RevisingBackend.revise`)
             if not self.revises_path:
                 by_rig = s.landmarks.by_rig.copy()

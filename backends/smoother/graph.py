@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import L, X
 
 from backends.smoother import joint
-from backends.smoother.factors import FactorMaker, landmark_key, pose_key
+from backends.smoother.factors import FactorMaker, GraphUpdate
 from backends.smoother.landmarks import by_pose
 from backends.smoother.state import SmootherState
-from backends.smoother.tracks import GraphProblem, Tracks
+from backends.smoother.tracks import Tracks
 from slam.data import IdArray
 from slam.errors import SlamError
 from slam.geometry.se3 import Array, adjoint, inverse, transform
@@ -54,12 +53,7 @@ class Solved:
     # By how much (6, 6) the last pose is less certain than the anchor before it: over many frames this adds up to the
     # path's drift. The covariance of the motion would not, as each frame has an error of its own that the next forgets.
     drift: Array
-    spread: Array  # covariances (N, 6, 6) of those that are new
-
-    def displaced(self, M: Array) -> Solved:
-        """After a displacement M (4, 4) in the world."""
-        points, linearised = transform(M, self.points), transform(M, self.linearised)
-        return replace(self, poses=M @ self.poses, points=points, linearised=linearised)
+    covariances: Array  # covariances (N, 6, 6) of those that are new
 
 
 class Graph:
@@ -74,15 +68,34 @@ class Graph:
 
     Attributes:
         number: of the newest pose in it; −1 for none.
+        to_state: takes gtsam's coordinates to the state's (4, 4).
     """
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:
-        self._careful = 0  # number of the first pose whose factors may be made quickly again, after a failure
         self._make, self._lag = make, lag
-        self.restart()
+        self.number = -1
+        self._taken = 0  # rows of that pose that are in it: landmarks are added after an update
+        self.to_state = np.eye(4)
+        self._careful = 0  # number of the first pose whose factors may throw again, after a failure
 
-    def restart(self) -> None:
-        """Leave what is in it: the next state is put in whole."""
+    def update(self, s: SmootherState) -> tuple[Solved, str]:
+        """The solution for a state with more poses than the last one; and why gtsam failed, if it did.
+
+        After a failure there are no landmarks among its variables. Raises SolverError where gtsam fails again.
+        """
+        try:
+            if self._is_of(s):
+                return self._solve(s, GraphUpdate(self._make, inverse(self.to_state))), ""
+            return self.rebuild(s), ""
+        except SolverError as error:
+            self._careful = s.number + _CAREFUL
+            return self.rebuild(replace(s, landmarks=s.landmarks.without_variables())), str(error)
+
+    def rebuild(self, s: SmootherState, steps: int = 0, hold: bool = False) -> Solved:
+        """The solution with all anew, after so many `steps` more than usual; SolverError where gtsam fails.
+
+        Where `hold` says so, all moves as a whole so that the newest pose stays.
+        """
         parameters = gtsam.ISAM2Params()
         parameters.relinearizeSkip = 1
         parameters.setRelinearizeThreshold(0.01)
@@ -90,97 +103,67 @@ class Graph:
         self._solver = gtsam.IncrementalFixedLagSmoother(
             _ENDLESS if self._lag is None else float(self._lag), parameters
         )
-        self._tracks = Tracks(self._make, self._lag)
-        self.number, self._taken = -1, 0
-        self._base: Array = np.zeros((6, 6))  # covariance of the first pose in the world, besides its prior
-        self._poses: dict[int, Array] = {}
-        self._start = np.eye(4)  # the first pose
-        self._to_state = np.eye(4)  # takes gtsam's coordinates to the state's
-        self._kind = False, 0
-
-    def followed(self, s: SmootherState) -> tuple[Solved, str]:
-        """The solution for a state with more poses than the last one; and why gtsam failed, if it did.
-
-        After a failure there are no landmarks among its variables. Raises SolverError where gtsam fails with the new
-        graph as well.
-        """
-        why = ""
-        if self.number < s.number and self._is_of(s):
-            number, self.number = self.number, -1  # until it is done: an interrupted call leaves a graph unknown
-            try:
-                problem = GraphProblem(to_graph=inverse(self._to_state))
-                return self._update(s, range(number + 1, s.number + 1), problem), ""
-            except SolverError as error:
-                why, self._careful = str(error), s.number + (self._lag or _CAREFUL)
-        if why:
-            s = replace(s, landmarks=s.landmarks.without_variables(int(s.ages[-1])))
-        return self.rebuilt(s), why
-
-    def rebuilt(self, s: SmootherState, steps: int = 0) -> Solved:
-        """The solution with all anew, after so many `steps` more than usual; SolverError where gtsam fails."""
-        self.restart()
-        oldest, self._careful = s.oldest(self._lag, s.number), max(self._careful, s.number + 1)
-        self._kind, self._start = _kind(s), s.poses[s.of(oldest)]
+        self._tracks = Tracks(self._make)
+        self._careful = max(self._careful, s.number + 1)
+        oldest, self.number, self._revisions = s.oldest(self._lag, s.number), -1, s.revisions
+        self.to_state = np.eye(4)
+        self._start = s.poses[s.of(oldest)]  # the first pose; its covariance in the world besides its prior is `_base`
         prior, self._base = first_prior(s, oldest)
-        problem = GraphProblem()
-        problem.factors.add(self._make.prior(oldest, s.start if oldest == s.begun else self._start, prior))
-        return self._update(s, range(oldest, s.number + 1), problem, steps)
+        update = GraphUpdate(self._make)
+        update.factors.add(self._make.prior(oldest, s.start if oldest == s.begun else self._start, prior))
+        return self._solve(s, update, steps, hold)
 
-    def displaced(self, M: Array) -> None:
-        """Follow a displacement M (4, 4) of all that the state has in the world: what is in it is relative."""
-        self._to_state, self._start = M @ self._to_state, M @ self._start
-        self._poses = {number: M @ T for number, T in self._poses.items()}
-
-    def _update(self, s: SmootherState, numbers: range, problem: GraphProblem, steps: int = 0) -> Solved:
-        """The solution with what is in a problem, and poses of some numbers with what was measured from them."""
+    def _solve(self, s: SmootherState, update: GraphUpdate, steps: int = 0, hold: bool = False) -> Solved:
+        """The solution with what is in an update, the poses that the graph lacks, and what was measured from them."""
+        last, self.number = self.number, -1  # until it is done: an interrupted call leaves a graph unknown
         oldest = s.oldest(self._lag, s.number)
-        # until this update is done; since the last one more than a lag of poses may have come
-        begin = min(oldest, numbers.start - 1) if self._poses else oldest
-        for number in numbers:
+        begin = oldest if last < 0 else min(oldest, last)  # more than a lag of poses may have come since the last one
+        for number in range(begin if last < 0 else last + 1, s.number + 1):
             if number > begin:
-                self._tracks.add_rows(problem, s, number - 1, begin, self._taken)
-            self._tracks.add_pose(problem, s, number, begin)
-            self._tracks.add_rows(problem, s, number, begin)
+                self._tracks.add_rows(update, s, number - 1, begin, self._taken)
+            update.add_pose(s, number, begin)
+            self._tracks.add_rows(update, s, number, begin)
             self._taken = len(s.sights[s.of(number)])
-        kept = self._tracks.keep(problem, s)
-        made = self._tracks.make_smart(problem, s.number < self._careful)
+        kept = self._tracks.keep(update, s)
+        made = self._tracks.make_smart(update, s.number < self._careful)
         # Two steps of Gauss and Newton. What leaves the lag fixes where its neighbours stay linearised, and that is to
-        # be where they are once the newest pose is solved for. gtsam's clock is the latest time of a variable: in the
-        # first step all that is new has the time of the last update, so that nothing leaves.
-        now: dict[Any, Any] = dict.fromkeys(problem.values.keys(), float(s.ages[s.of(numbers.start)] - 1))
+        # be where they are once the newest pose is solved for: without timestamps, nothing leaves in the first step.
         with solving():
-            self._solver.update(problem.factors, problem.values, now, problem.removed)
+            self._solver.update(update.factors, update.values, {}, update.removed)
             slots = self._solver.getISAM2Result().getNewFactorsIndices()
             for _ in range(steps):
                 self._solver.update()
-            self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.ages)
+            self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), update.timestamps)
             values = self._solver.calculateEstimate()
         for track, place in made:
             track.slot = slots[place]
         self._tracks.forget(s, oldest)
-        new = [i for i in numbers if i >= oldest] if self._poses else [s.number]
-        return self._solution(s, oldest, new, kept, values)
+        if hold:
+            self.to_state = s.poses[-1] @ inverse(values.atPose3(X(s.number)).matrix())
+            self._start = self.to_state @ self._start
+        return self._solution(s, oldest, kept, values)
 
-    def _solution(self, s: SmootherState, oldest: int, new: list[int], kept: list[int], values: gtsam.Values) -> Solved:
-        """What gtsam found, in the state's coordinates: `new` poses, and variables of landmarks that are `kept`."""
-        poses = self._to_state @ [values.atPose3(pose_key(i)).matrix() for i in range(oldest, s.number + 1)]
-        self._poses = dict(zip(range(oldest, s.number + 1), poses))
+    def _solution(self, s: SmootherState, oldest: int, kept: list[int], values: gtsam.Values) -> Solved:
+        """What gtsam found, in the state's coordinates: poses, and variables of landmarks that are `kept`."""
+        poses = self.to_state @ [values.atPose3(X(i)).matrix() for i in range(oldest, s.number + 1)]
         points, linearised = (
-            transform(self._to_state, np.array([v.atPoint3(landmark_key(n)) for n in kept]).reshape(-1, 3))
+            transform(self.to_state, np.array([v.atPoint3(L(n)) for n in kept]).reshape(-1, 3))
             for v in (values, self._solver.getLinearizationPoint() if kept else values)
         )
         at = [max(oldest, i) for i in (s.anchor, s.number - 1, s.number)]
-        P = self._relative(at)
+        P, (anchor, before, newest) = self._relative(at), poses[np.array(at) - oldest]
         if not (np.isfinite(poses).all() and np.isfinite(P).all() and (np.diag(P) > 0).all()):
             raise SolverError("gtsam: the solution is not finite, or a variance not positive")
-        spread = np.array([*(self._covariance([i]) for i in new[:-1]), (P + self._rigid(at))[12:, 12:]])
-        anchor, before, newest = poses[np.array(at) - oldest]
+        new = range(max(oldest, s.solved + 1), s.number)
+        covariances = np.array(
+            [*(self._covariance([i], poses[[i - oldest]]) for i in new), P[12:, 12:] + self._rigid(newest[None])]
+        )
         shared = joint.anchored(P, np.zeros((6, 6)), np.array([before, newest]))
-        shared[:6, :6] = spread[-1]
+        shared[:6, :6] = covariances[-1]
         A = adjoint(inverse(newest) @ anchor)
         drift = joint.root(P[12:, 12:] - A @ P[:6, :6] @ A.T)
         self.number = s.number
-        return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, shared, drift @ drift.T, spread)
+        return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, shared, drift @ drift.T, covariances)
 
     def joint_covariance(self, s: SmootherState, first: int) -> tuple[int, Array]:
         """Number of the first pose, and the joint covariance (6 K, 6 K) of the poses from there to the newest.
@@ -189,11 +172,11 @@ class Graph:
         Poses that are not in the graph yet follow from the motion model.
         """
         if not self._is_of(s):
-            return s.number, s.spread[-1]
+            return s.number, s.covariances[-1]
         oldest = s.oldest(self._lag, self.number)
         first = max(oldest, first)
         begin = max(oldest, min(first, self.number - 1))  # where the motion goes on, it needs two poses
-        P = self._covariance(list(range(begin, self.number + 1)))
+        P = self._covariance(list(range(begin, self.number + 1)), s.poses[s.of(begin) : s.of(self.number) + 1])
         for number in range(self.number + 1, s.number + 1):
             _, J, noise, _ = s.moved(self._make.models, number)
             J = J[:, -len(P) :]
@@ -201,35 +184,35 @@ class Graph:
             own = cross[:, -J.shape[1] :] @ J.T + noise
             P = np.block([[P, cross.T], [cross, 0.5 * (own + own.T)]])  # what is not symmetric would grow fourfold
             gain = np.linalg.solve(P[-6:, -6:], P[-6:])  # a pose that was solved for alone is known better
-            P = P + gain.T @ (s.spread[s.of(number)] - P[-6:, -6:]) @ gain
+            P = P + gain.T @ (s.covariances[s.of(number)] - P[-6:, -6:]) @ gain
         rows = slice(6 * (first - begin), None)
         return first, P[rows, rows]
 
     def landmark_covariance(self, s: SmootherState, serial: int, position: Array) -> Array | None:
         """Covariance (3, 3) in the world of a landmark at a position (3,), if it is a variable of the state's graph."""
-        key = landmark_key(serial)
+        key = L(serial)
         if not self._is_of(s) or not self._solver.getLinearizationPoint().exists(key):
             return None
-        J, R = by_pose(self._start, position[None])[0], self._to_state[:3, :3]
+        J, R = by_pose(self._start, position[None])[0], self.to_state[:3, :3]
         return np.asarray(R @ self._solver.getISAM2().marginalCovariance(key) @ R.T + J @ self._base @ J.T)
 
     def _is_of(self, s: SmootherState) -> bool:
         """Whether it is the state's graph, up to poses since the last update; not if that was interrupted."""
-        return self.number == s.solved >= max(s.begun, s.first) and self._kind == _kind(s)
+        return self.number == s.solved >= max(s.begun, s.first) and self._revisions == s.revisions
 
-    def _covariance(self, numbers: list[int]) -> Array:
-        """Joint covariance (6 K, 6 K) in the world of poses."""
-        return self._relative(numbers) + self._rigid(numbers)
+    def _covariance(self, numbers: list[int], poses: Array) -> Array:
+        """Joint covariance (6 K, 6 K) in the world of poses (K, 4, 4)."""
+        return self._relative(numbers) + self._rigid(poses)
 
-    def _rigid(self, numbers: list[int]) -> Array:
-        """What is known of the first pose in the world as a joint covariance (6 K, 6 K) of poses."""
-        A = adjoint(inverse(np.array([self._poses[i] for i in numbers])) @ self._start).reshape(-1, 6)
+    def _rigid(self, poses: Array) -> Array:
+        """What is known of the first pose in the world as a joint covariance (6 K, 6 K) of poses (K, 4, 4)."""
+        A = adjoint(inverse(poses) @ self._start).reshape(-1, 6)
         return np.asarray(A @ self._base @ A.T)
 
     def _relative(self, numbers: list[int]) -> Array:
         """Joint covariance (6 K, 6 K) of poses, besides what is known of the first one in the world."""
         each, at = np.unique(numbers, return_inverse=True)
-        keys = [pose_key(i) for i in each.tolist()]
+        keys = list(map(X, each.tolist()))
         with solving():
             isam = self._solver.getISAM2()
             P = isam.marginalCovariance(keys[0]) if len(keys) == 1 else isam.jointMarginalCovariance(keys).fullMatrix()
@@ -238,38 +221,15 @@ class Graph:
         return np.asarray(0.5 * (P + P.T))
 
 
-def _kind(s: SmootherState) -> tuple[bool, int]:
-    """What a graph is built for: whether landmarks are known in the world, and which revision of the measurements."""
-    return s.fixed, s.revisions
-
-
 def first_prior(s: SmootherState, number: int) -> tuple[Array, Array]:
     """Covariance of the prior of a pose that comes first (6, 6), and its covariance in the world besides.
 
     What was measured from the pose with which the problem begins is in the graph, and not in its prior. Of a later one
     it is in both; but what known landmarks told of it is not told again, see `Tracks`.
     """
-    P = s.prior if number == s.begun else s.spread[s.of(number)]
+    P = s.prior if number == s.begun else s.covariances[s.of(number)]
     if s.fixed:
         return P, np.zeros((6, 6))
     prior = np.diag(np.minimum(np.diag(P), _FIRM))
     base = joint.root(P - prior)
     return prior, base @ base.T
-
-
-def minimised(problem: GraphProblem, iterations: int) -> gtsam.Values:
-    """The values that fit all factors best, by Levenberg-Marquardt; SolverError if gtsam finds nothing better."""
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(iterations)
-    parameters.setRelativeErrorTol(1e-9)
-    parameters.setAbsoluteErrorTol(1e-9)
-    with solving():
-        before = problem.factors.error(problem.values)
-        optimizer = gtsam.LevenbergMarquardtOptimizer(problem.factors, problem.values, parameters)
-        values = optimizer.optimize()
-        after = problem.factors.error(values)
-    if not np.isfinite(after) or after > before:
-        raise SolverError(f"Levenberg-Marquardt found no solution (error {before:.6g} to {after:.6g})")
-    if optimizer.iterations() >= iterations:
-        logging.getLogger(__name__).warning("Levenberg-Marquardt was stopped after %d iterations", iterations)
-    return values

@@ -11,13 +11,6 @@ import numpy as np
 from slam.geometry.se3 import Array, adjoint, inverse
 
 
-def alone(P: Array) -> Array:
-    """Of one pose with a covariance P (6, 6) in the world, which is the anchor."""
-    joint = np.zeros((18, 18))
-    joint[:6, :6] = P
-    return joint
-
-
 def moved(joint: Array, J: Array, noise: Array) -> Array:
     """With the next pose, of a Jacobian J (6, 12) by the last two, and noise (6, 6) that is added."""
     F = np.zeros((18, 18))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -14,7 +15,6 @@ from slam.geometry.se3 import Array, points_by_pose
 from slam.window.stereo import RectifiedStereo
 
 RECENT = 12  # cost: so many of its last measurements give a landmark's position and covariance
-VARIABLE = -(10**9)  #: in place of `SmootherLandmarks.since`: no smart factor, but a variable of the graph
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,8 @@ class SmootherLandmarks(LandmarkRows):
     world: BoolArray  # whether that does not depend on any pose (S,)
     z: Array  # its last measurements (S, RECENT, 3)
     pose: IndexArray  # and the numbers of their poses (S, RECENT), −1 for none
-    # age (`SmootherState.ages`) from which the span of its smart factor counts (S,); or VARIABLE, but not of known ones
-    since: IndexArray
+    since: IndexArray  # tick (`SmootherState.ticks`) from which the span of its smart factor counts (S,)
+    variable: BoolArray  # whether it stays a variable of the graph instead (S,); known ones begin as variables anyway
     linearised: Array  # where the graph has it linearised, if it is a variable (S, 3) [m]
     by_rig: Array  # derivatives of the positions by errors of the rig (S, 3, m)
 
@@ -43,7 +43,8 @@ class SmootherLandmarks(LandmarkRows):
         n = len(ids)
         return cls(
             ids, serial + np.arange(n), position, own, np.zeros((n, 3, 3)), position, information, np.full(n, world),
-            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp), position, by_rig,
+            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp), np.zeros(n, bool),
+            position, by_rig,
         )  # fmt: skip
 
     @classmethod
@@ -57,20 +58,25 @@ class SmootherLandmarks(LandmarkRows):
         """Covariances (S, 3, 3) of the positions where the newest pose is known, in world axes."""
         return self.own + self.away
 
-    def spans(self, rows: IndexArray, last: IndexArray, age: int, track: int, solved: int) -> IndexArray:
-        """`since` (M,) of landmarks that a pose of an `age` measures; the last that did were of ages (M,), −1 for none.
+    @cached_property
+    def variables(self) -> dict[int, Array]:
+        """Positions (3,) of those that are variables, by serial number."""
+        return dict(zip(self.serial[self.variable].tolist(), self.position[self.variable]))
+
+    def spans(self, rows: IndexArray, last: IndexArray, tick: int, track: int, solved: int) -> IndexArray:
+        """`since` (M,) of landmarks that a pose at a `tick` measures; `last` (M,) is of those that did before, or −1.
 
         A smart factor spans at most `track` poses. Then, or if a landmark was not measured for half as many, it goes on
         in a new one. If landmarks that were found together all began anew at once, the motion model alone would tie
         that pose to the one before. So the first factor spans fewer, down to half of them, differently for each
-        landmark. Where poses that measured no known landmark came since the one of age `solved`, every other factor
+        landmark. Where poses that measured no known landmark came since the one at tick `solved`, every other factor
         takes this measurement as well, unless its first pose has left the graph.
         """
         since, half = self.since[rows], max(track // 2, 1)
-        longer = (last >= 0) & (0 <= solved < age - 1) & (since > solved - track) & (self.serial[rows] // 2 % 2 == 0)
-        anew = np.where(since <= age - track, age, since)
-        anew = np.where((last < 0) | (last < age - half), age - self.serial[rows] % half, anew)
-        return np.where(longer | (since == VARIABLE), since, anew)
+        longer = (last >= 0) & (0 <= solved < tick - 1) & (since > solved - track) & (self.serial[rows] // 2 % 2 == 0)
+        anew = np.where(since <= tick - track, tick, since)
+        anew = np.where((last < 0) | (last < tick - half), tick - self.serial[rows] % half, anew)
+        return np.where(longer, since, anew)
 
     def measured(self, rows: IndexArray, z: Array, pose: int, since: IndexArray, oldest: int) -> Self:
         """With one more measurement (M, 3) of some landmarks, from the pose of a number, in factors `since` (M,).
@@ -91,11 +97,11 @@ class SmootherLandmarks(LandmarkRows):
         return replace(self, z=zs, pose=poses, away=away, since=every)
 
     def with_variables(
-        self, rows: IndexArray, last: IndexArray, z: Array, age: int, track: int, most: int, T: Array, ratio: float
+        self, rows: IndexArray, last: IndexArray, z: Array, tick: int, track: int, most: int, T: Array, ratio: float
     ) -> Self:
         """With more landmarks as variables, of those that a pose T (4, 4) is about to measure (M, 3); at most so many.
 
-        The pose is of an `age`, and those that measured the landmarks last are of ages `last` (S,), −1 for none.
+        The pose is at a `tick`, and those that measured the landmarks last are at ticks `last` (S,), −1 for none.
 
         Where it measures more, none becomes one: many landmarks that come and go hold the path well enough, at half the
         cost, and forget where features were that slide (`slam.models.SlideModel`). A landmark becomes a variable when
@@ -109,21 +115,21 @@ class SmootherLandmarks(LandmarkRows):
         """
         if len(rows) > most:
             return self
-        variable, since = self.since == VARIABLE, self.since.copy()
+        variable, since = self.variable.copy(), self.since.copy()
         deviation = np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2))
         offset = np.linalg.norm(self.position[rows] - self.linearised[rows], axis=1)
         apart = ratio * np.where(variable[rows], offset, deviation)
         nonlinear = apart >= np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
-        full = ~variable[rows] & (since[rows] <= age - track) & (last[rows] >= age - max(track // 2, 1))
+        full = ~variable[rows] & (since[rows] <= tick - track) & (last[rows] >= tick - max(track // 2, 1))
         new = rows[full & ~nonlinear & np.isfinite(z[:, 2])]
-        leaving = np.flatnonzero(variable & (last < age - track))
+        leaving = np.flatnonzero(variable & (last < tick - track))
         leaving = leaving[np.argsort(last[leaving], kind="stable")][: max(int(variable.sum()) + len(new) - most, 0)]
         new = np.sort(new)[: most - int(variable.sum()) + len(leaving)]
-        since[leaving] = since[rows[variable[rows] & nonlinear]] = age - track  # full
-        since[new] = VARIABLE
+        leaving = np.append(leaving, rows[variable[rows] & nonlinear])
+        variable[leaving], since[leaving], variable[new] = False, tick - track, True  # full
         linearised = self.linearised.copy()
         linearised[new] = self.position[new]
-        return replace(self, since=since, linearised=linearised)
+        return replace(self, since=since, variable=variable, linearised=linearised)
 
     def solved(self, serials: IdArray, points: Array, linearised: Array) -> Self:
         """With variables (V,), by serial number, at points (V, 3), and where the graph has them linearised (V, 3)."""
@@ -131,9 +137,9 @@ class SmootherLandmarks(LandmarkRows):
         position[rows], at[rows] = points, linearised
         return replace(self, position=position, linearised=at)
 
-    def without_variables(self, age: int) -> Self:
-        """With smart factors that begin at an age in place of all variables."""
-        return replace(self, since=np.where(self.since == VARIABLE, age, self.since))
+    def without_variables(self) -> Self:
+        """With smart factors in place of all variables."""
+        return replace(self, variable=np.zeros(len(self), bool))
 
     def left_behind(self, rows: IndexArray, T: Array, drift: Array) -> Self:
         """After a pose T (4, 4) that measured only the landmarks `rows`, and is off by a drift (6, 6) from the last."""
@@ -173,19 +179,19 @@ class SmootherLandmarks(LandmarkRows):
         )
         return replace(self, position=position, own=own)
 
-    def covariances(self, chosen: IndexArray, newest: int, poses: Array, spread: Array) -> Array:
+    def covariances(self, chosen: IndexArray, newest: int, poses: Array, P: Array) -> Array:
         """Covariances (M, 3, 3) in the world of some landmarks: ``C + J P Jᵀ``.
 
         C is known where all poses are. The landmark moves with the pose that measured it last, of which P was known
         when it was the newest, by ``J = (1 − C Λ) G``: G as a point that is fixed to the pose, less what is known of it
         in the world beforehand, Λ. One that was never measured moves with the newest pose, and by the drift since it is
-        known. The last of the `poses` (K, 4, 4), with covariances `spread` (K, 6, 6), is of number `newest`.
+        known. The last of the `poses` (K, 4, 4), with covariances P (K, 6, 6), is of number `newest`.
         """
         marks, last = self.select(chosen), self.pose[chosen].max(axis=1, initial=-1)
         row = (np.where(last < 0, newest, last) - newest - 1).clip(-len(poses))
         J = by_pose(poses[row], marks.position)
         J[marks.world] -= (marks.own @ marks.information @ J)[marks.world]
-        C = marks.own + J @ spread[row] @ np.swapaxes(J, 1, 2)
+        C = marks.own + J @ P[row] @ np.swapaxes(J, 1, 2)
         C[last < 0] += marks.away[last < 0]
         return np.asarray(0.5 * (C + np.swapaxes(C, 1, 2)))
 

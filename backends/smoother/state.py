@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from slam.geometry.arrays import Table
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 from slam.window.motion import LONGEST, predicted
+from slam.window.stereo import RectifiedStereo
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +53,9 @@ class SmootherState:
     poses: Array  # T_world_left (K, 4, 4)
     stamps: Array  # their times (K,) [s]
     rests: BoolArray  # whether the camera rested since the pose before (K,)
-    ages: IndexArray  # how many poses up to each (K,) gave the graph anything: the lag is counted in these
+    ticks: IndexArray  # how many poses up to each gave the graph anything (K,): the lag is counted in these
     sights: tuple[Sight, ...]  # what the graph is given of each
-    spread: Array  # covariance in the world of each when it was the newest that was solved for (K, 6, 6)
+    covariances: Array  # covariance in the world of each when it was the newest that was solved for (K, 6, 6)
     joint: Array  # covariance (18, 18) of the anchor and the last two poses, see `backends.smoother.joint`
     by_rig: Array  # derivatives of the last two poses' errors by errors of the rig (12, m)
     # of the pose with which the problem begins, before anything was measured from it: covariance (6, 6), and where it
@@ -69,7 +70,7 @@ class SmootherState:
     left_stamps: Array = field(default_factory=lambda: np.zeros(0))  # times of poses that are kept no more (N,) [s]
     left_poses: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # and these, in no order
     measured: bool = False  # whether the newest pose may not be updated any more
-    revisions: int = 0  # how often the measurements were revised
+    revisions: int = 0  # how often a new graph was needed: measurements revised, landmarks first known in the world
     contradicted: int = 0  # updates in succession in which most observations agreed on another pose than expected
 
     @classmethod
@@ -122,17 +123,28 @@ class SmootherState:
         """Row of a pose."""
         return number - self.first
 
-    def age(self, numbers: IndexArray | int) -> IndexArray:
-        """`ages` of poses, −1 of one that is not kept."""
+    def tick(self, numbers: IndexArray | int) -> IndexArray:
+        """`ticks` of poses, −1 for one that is not kept."""
         rows = np.asarray(numbers) - self.first
-        return np.where(rows < 0, -1, self.ages[np.maximum(rows, 0)])
+        return np.where(rows < 0, -1, self.ticks[np.maximum(rows, 0)])
 
     def oldest(self, lag: int | None, newest: int) -> int:
         """Number of the oldest pose in the graph, once it has the newest one of such a number."""
         least = max(self.begun, self.first)
         if lag is None:
             return least
-        return max(least, self.first + int(np.searchsorted(self.ages, self.ages[self.of(newest)] - lag)))
+        return max(least, self.first + int(np.searchsorted(self.ticks, self.ticks[self.of(newest)] - lag)))
+
+    def corrected(self, correct: Callable[[Array], Array]) -> SmootherState:
+        """With corrected measurements; MeasurementError if one is not finite."""
+
+        def again(z: Array) -> Array:
+            return RectifiedStereo.corrected("smoother", z, correct) if len(z) else z
+
+        z, there = self.landmarks.z.copy(), self.landmarks.pose >= 0
+        z[there] = again(z[there])
+        sights = tuple(replace(sight, z=again(sight.z)) for sight in self.sights)
+        return replace(self, sights=sights, landmarks=replace(self.landmarks, z=z), revisions=self.revisions + 1)
 
     def without_old(self, past: int, lag: int) -> SmootherState:
         """Without what is kept of all but the last `past` poses before those that are smoothed."""
@@ -153,7 +165,7 @@ class SmootherState:
 
     def _without(self, rows: IndexArray) -> SmootherState:
         """Without what is kept of some poses; these and their times stay in the path."""
-        names, gone = ("poses", "stamps", "rests", "ages", "spread"), set(rows.tolist())
+        names, gone = ("poses", "stamps", "rests", "ticks", "covariances"), set(rows.tolist())
         return replace(
             self, **{name: np.delete(getattr(self, name), rows, 0) for name in names},
             sights=tuple(one for row, one in enumerate(self.sights) if row not in gone),

@@ -8,10 +8,10 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import L, X
 
 from backends.smoother import SmootherBackend
-from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
-from backends.smoother.landmarks import VARIABLE
+from backends.smoother.factors import FactorMaker, to_pose3
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
@@ -277,7 +277,7 @@ def test_a_landmark_measured_for_longer_than_the_lag_keeps_what_was_known_of_it(
     estimate = kept.estimate()
     off = estimate.positions - data.points[estimate.ids]
     distances = np.einsum("ni,nij,nj->n", off, np.linalg.inv(estimate.covariances), off)
-    assert np.median(distances) < 6 and (kept.state.landmarks.since == VARIABLE).sum() >= 4
+    assert np.median(distances) < 6 and kept.state.landmarks.variable.sum() >= 4
 
 
 def test_landmarks_that_are_variables_outlast_more_than_a_lag_of_frames_that_measured_nothing():
@@ -289,10 +289,10 @@ def test_landmarks_that_are_variables_outlast_more_than_a_lag_of_frames_that_mea
         else:
             assert not (step(backend, stamp, seen, known).reason and k), "it is not built anew"
         if k == 39:
-            before, variables = backend.estimate(landmarks=False), backend.state.landmarks.since == VARIABLE
+            before, variables = backend.estimate(landmarks=False), backend.state.landmarks.variable
     after = backend.estimate(landmarks=False)
     assert variables.sum() >= 4
-    assert (backend.state.landmarks.since[: len(variables)] == VARIABLE)[variables].all()
+    assert backend.state.landmarks.variable[: len(variables)][variables].all()
     deviations = [np.sqrt(np.trace(e.covariance[3:, 3:])) for e in (before, after)]
     assert deviations[1] < 1.5 * deviations[0], deviations
     assert errors(after.T_world_left, data.poses[-1])[0] < 3 * deviations[1]
@@ -423,11 +423,11 @@ def test_mended_measurements_do_not_part_the_path_from_poses_that_have_left():
 def test_the_motion_model_does_not_pull_at_the_path_as_a_whole():
     """Nothing else holds it: linearised at other poses than the rest, the model moved a lag by up to 9 m in a bend."""
     rng = np.random.default_rng(0)
-    factor = FactorMaker(RectifiedStereo.of(RIG), MODELS).motion([pose_key(i) for i in range(3)], np.array([0.1, 0.2]))
+    factor = FactorMaker(RectifiedStereo.of(RIG), MODELS).motion([X(i) for i in range(3)], np.array([0.1, 0.2]))
     for _ in range(3):
         values, poses = gtsam.Values(), se3.exp(rng.normal(0, 0.3, (3, 6)))
         for i, T in enumerate(poses):
-            values.insert(pose_key(i), to_pose3(T))
+            values.insert(X(i), to_pose3(T))
         A, b = factor.linearize(values).jacobian()
         whole = se3.adjoint(se3.inverse(poses)).reshape(-1, 6)  # the poses' perturbations where the world moves
         assert np.linalg.norm(A.T @ b) > 1 and np.abs(whole.T @ A.T @ b).max() < 1e-6 * np.linalg.norm(A.T @ b)
@@ -440,12 +440,10 @@ def test_a_known_landmark_tells_what_is_known_of_it():
     P, T = A @ A.T, se3.exp(rng.normal(0, 0.5, 6))
     factor = FactorMaker(RectifiedStereo.of(RIG), MODELS).known_from(3, 7, local, P)
     values = gtsam.Values()
-    values.insert(pose_key(3), to_pose3(T))
-    values.insert(landmark_key(7), se3.transform(T, local[None])[0])
+    values.insert(X(3), to_pose3(T))
+    values.insert(L(7), se3.transform(T, local[None])[0])
     linear = factor.linearize(values)
-    by_landmark = (
-        linear.information()[-3:, -3:] if linear.keys()[-1] == landmark_key(7) else linear.information()[:3, :3]
-    )
+    by_landmark = linear.information()[-3:, -3:] if linear.keys()[-1] == L(7) else linear.information()[:3, :3]
     R = T[:3, :3]
     np.testing.assert_allclose(np.linalg.inv(by_landmark), R @ P @ R.T, rtol=1e-6, atol=1e-9)
     assert np.abs(linear.jacobian()[1]).max() < 1e-6

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from backends.smoother import SmootherBackend
+from backends.smoother.graph import SolverError
 from slam.data import UpdateStatus
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
@@ -115,3 +116,22 @@ def test_a_camera_that_was_moved_while_it_saw_nothing(lag):
     assert sum(rejected[70:73]) > 30 and sum(rejected[74:]) < 10
     assert np.abs(off[74:]).max() < 0.05
     assert np.sqrt(np.diag(backend.estimate(landmarks=False).covariance)).max() < 0.3
+
+
+def test_a_graph_that_cannot_be_built_with_landmarks_as_variables_is_built_without(monkeypatch):
+    """Where that failed in a revision it failed in every later frame."""
+    data, known = scene(path(60, DT, np.array([0.05, 0.0, 0.0]), np.zeros(3)), points=8, limit=8), set()
+    backend = SmootherBackend(RIG, MODELS)
+    for stamp, _, seen in list(data)[:50]:
+        step(backend, stamp, seen, known)
+    assert backend.state.landmarks.variable.any()
+
+    def fail(*_):
+        raise SolverError("gtsam: Indeterminant linear system")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("backends.smoother.tracks.Tracks._make_variable", fail)
+        backend.revise(lambda z: z)
+        reports = [step(backend, stamp, seen, known) for stamp, _, seen in list(data)[50:]]
+    assert all(report.status is UpdateStatus.OK for report in reports), reports[0].reason
+    assert "built anew after gtsam: Indeterminant" in reports[0].reason
