@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import typer
 from rich.console import Console
 
 from slam.commands.display import empty_table, progress
@@ -38,7 +39,10 @@ def calibrate(
     quiet: bool,
     overwrite: bool,
 ) -> None:
-    """Run recordings of one rig; write and print what they say of it, see `slam.run.calibrating`."""
+    """Run recordings of one rig; write and print what they say of it, see `slam.run.calibrating`.
+
+    The exit status is 1 where they do not tell how good the calibration is, which a warning explains.
+    """
     twice = next((text for k, text in enumerate(texts) if text in texts[:k]), None)
     if twice is not None:
         raise ConfigurationError(f"{twice}: given twice; it would count as two recordings that agree")
@@ -52,10 +56,11 @@ def calibrate(
         found = run(opened, out, settings, frames, inputs, overwrite, tell)
     for warning in found["warnings"]:
         logging.getLogger(__name__).warning("%s", warning)
-    if quiet:
-        return
-    _print(found)
-    print(f"Use it: slam run SEQUENCE --calibration {out}" if found["worth_correcting"] else f"File: {out}")
+    if not quiet:
+        _print(found)
+        print(f"Use it: slam run SEQUENCE --calibration {out}" if found["worth_correcting"] else f"File: {out}")
+    if found["warnings"]:
+        raise typer.Exit(1)
 
 
 def unit_of(row: dict[str, Any], focal: float) -> tuple[float, str]:
@@ -81,7 +86,8 @@ def _print(found: dict[str, Any]) -> None:
     console.print(_SIGN, highlight=False)
     for one in found["recordings"]:
         pairs, unsolved = one["pairs"], one["unsolved_pairs"]
-        tells = f"{pairs} pairs of views" if pairs else "no pair of views that shows motion: left out"
+        tells = f"{pairs} pairs of views" if pairs else "no pair of views far enough apart"
+        tells += ": left out" if one["left_out"] else ""
         if unsolved:
             tells += f"; in {unsolved} others too few features agree on one motion of the camera"
         console.print(f"{one['sequence']}: {one['frames']} frames, {tells}", markup=False)

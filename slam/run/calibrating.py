@@ -106,16 +106,17 @@ def _run(
     for _, result in system.run(sequence.frames(*frames)):
         on_frame(result)
         matched.append(len(result.matched))
-    own = system.calibration
+    own, evidence = system.calibration, system.calibration.evidence()
     found = {
         "sequence": sequence.name,
         "frames": len(matched),
         "matched": float(np.median(matched)) if matched else 0.0,  # landmarks found again in a frame
+        "left_out": evidence is None,
         "pairs": own.pairs,
         "unsolved_pairs": own.unsolved,
         "doubt": own.doubt,
     }
-    return found | own.kept().posterior.to_json(), own.evidence()
+    return found | own.kept().posterior.to_json(), evidence
 
 
 def _judged(
