@@ -73,6 +73,8 @@ def run(
     """
     require_outputs(options.outputs, overwrite=True)
     if options.record is not None:
+        if options.record.suffix.lower() != ".npz":
+            raise SlamError(f"{options.record}: a recording is a file of NumPy's: --record FILE.npz")
         if options.prior_map is not None:
             raise SlamError("a run that starts in a prior map cannot be recorded: the recording would lack the map")
         if options.config.map.monocular:
