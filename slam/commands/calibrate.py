@@ -23,8 +23,7 @@ from slam.settings import require_settable
 
 _SIGN = (
     "Corrections are added to measured pixels, seen from the principal point: cx and f are positive where the "
-    "calibration's are too large. Usual is how far good calibrations are off in that parameter alone; several together "
-    "may cancel, so the pixels above say whether it is much."
+    "calibration's are too large. Usual is how far good calibrations are off; several parameters may cancel"
 )
 _SHOWN = {"rad": (1e3, "mrad"), "1": (1e3, "10⁻³")}  # what a parameter is multiplied by, and its unit then
 _SHARES = "f", "aspect", "down", "forward"  # shown in per cent
@@ -83,7 +82,8 @@ def _print(found: dict[str, Any]) -> None:
     for text in filter(None, (found["judgement"], found["agreement"])):
         console.print(text, markup=False, highlight=False)
     console.print(table)
-    console.print(_SIGN, highlight=False)
+    much = ", so the pixels above say whether it is much" if found["judgement"] else ""
+    console.print(f"{_SIGN}{much}.", highlight=False)
     for one in found["recordings"]:
         pairs, unsolved = one["pairs"], one["unsolved_pairs"]
         tells = f"{pairs} pairs of views" if pairs else "no pair of views far enough apart"
