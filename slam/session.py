@@ -121,8 +121,8 @@ class Session:
         In an unknown place, a new map begins at the old one's pose, which is exact for it: it defines its coordinates.
         A single estimator cannot hold a pose that is uncertain by many metres and degrees together with landmarks seen
         from there: linearisation fails over such angles and makes it overconfident in a wrong pose. The new map's pose
-        relative to the earlier one is as uncertain as the predicted pose, until a place of the atlas is seen again. The
-        earlier landmarks remain in the atlas only.
+        relative to the earlier one is more uncertain than the predicted pose, see `covariance_after_unseen_motion` of
+        `slam.atlas.atlas`, until a place of the atlas is seen again. The earlier landmarks remain in the atlas only.
         """
         old, T, stamp = state.backend, elsewhere.T_world_left, features.stamp
         tracks = None

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import typer
 from rich.console import Console
 
 from slam.commands.display import empty_table, progress
@@ -22,8 +23,7 @@ from slam.settings import require_settable
 
 _SIGN = (
     "Corrections are added to measured pixels, seen from the principal point: cx and f are positive where the "
-    "calibration's are too large. Usual is how far good calibrations are off in that parameter alone; several together "
-    "may cancel, so the pixels above say whether it is much."
+    "calibration's are too large. Usual is how far good calibrations are off; several parameters may cancel"
 )
 _SHOWN = {"rad": (1e3, "mrad"), "1": (1e3, "10⁻³")}  # what a parameter is multiplied by, and its unit then
 _SHARES = "f", "aspect", "down", "forward"  # shown in per cent
@@ -38,7 +38,10 @@ def calibrate(
     quiet: bool,
     overwrite: bool,
 ) -> None:
-    """Run recordings of one rig; write and print what they say of it, see `slam.run.calibrating`."""
+    """Run recordings of one rig; write and print what they say of it, see `slam.run.calibrating`.
+
+    The exit status is 1 where they do not tell how good the calibration is, which a warning explains.
+    """
     twice = next((text for k, text in enumerate(texts) if text in texts[:k]), None)
     if twice is not None:
         raise ConfigurationError(f"{twice}: given twice; it would count as two recordings that agree")
@@ -52,10 +55,11 @@ def calibrate(
         found = run(opened, out, settings, frames, inputs, overwrite, tell)
     for warning in found["warnings"]:
         logging.getLogger(__name__).warning("%s", warning)
-    if quiet:
-        return
-    _print(found)
-    print(f"Use it: slam run SEQUENCE --calibration {out}" if found["worth_correcting"] else f"File: {out}")
+    if not quiet:
+        _print(found)
+        print(f"Use it: slam run SEQUENCE --calibration {out}" if found["worth_correcting"] else f"File: {out}")
+    if found["warnings"]:
+        raise typer.Exit(1)
 
 
 def unit_of(row: dict[str, Any], focal: float) -> tuple[float, str]:
@@ -78,10 +82,12 @@ def _print(found: dict[str, Any]) -> None:
     for text in filter(None, (found["judgement"], found["agreement"])):
         console.print(text, markup=False, highlight=False)
     console.print(table)
-    console.print(_SIGN, highlight=False)
+    much = ", so the pixels above say whether it is much" if found["judgement"] else ""
+    console.print(f"{_SIGN}{much}.", highlight=False)
     for one in found["recordings"]:
         pairs, unsolved = one["pairs"], one["unsolved_pairs"]
-        tells = f"{pairs} pairs of views" if pairs else "no pair of views that shows motion: left out"
+        tells = f"{pairs} pairs of views" if pairs else "no pair of views far enough apart"
+        tells += ": left out" if one["left_out"] else ""
         if unsolved:
             tells += f"; in {unsolved} others too few features agree on one motion of the camera"
         console.print(f"{one['sequence']}: {one['frames']} frames, {tells}", markup=False)

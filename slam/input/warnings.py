@@ -27,6 +27,8 @@ REPEATED = "the images are those of the frame before"
 #: guard: plausible times between frames [s]: a thousand frames a second to one in ten seconds.
 SHORTEST, LONGEST = 1e-3, 10.0
 
+_LEAP = 900.0  # guard: time between frames [s] from which on the clock may have been set: by time zones, at least
+
 _INTERVALS = 5  # guard: times between frames whose median is tested: single frames may be missing
 _POOR = 5  # guard: successive frames that must show too little before a warning
 _LAST_LOOK = 1024  # guard: last frame at which the stereo pair is checked
@@ -52,7 +54,8 @@ class InputWarnings:
         # angular velocity changes by ``density · √Δt`` in Δt, and the rotation by that times Δt.
         half_view = float(np.arctan(0.5 * rig.width / rig.left.fu))
         self._farthest = (half_view / models.motion.angular_acceleration) ** (2 / 3)
-        self._stamps: list[float] = []
+        self._stamps: list[float] = []  # of the first frames
+        self._last_stamp, self._leapt = np.inf, False  # whether that was said, or what explains it
         self._count = self._poor = self._unpaired = 0
         self._pair_warned = self._pair_is_right = False
         self._texture_warned = self._partners_explained = False
@@ -87,6 +90,13 @@ class InputWarnings:
             self._stamps.append(features.stamp)
             if len(self._stamps) > _INTERVALS:
                 self._check_intervals(float(np.median(np.diff(self._stamps))))
+        leap, self._last_stamp = features.stamp - self._last_stamp, features.stamp
+        if leap >= _LEAP and len(self._stamps) > _INTERVALS and not self._leapt:
+            self._leapt = True
+            self._warn(
+                f"frame {frame.index}: its stamp is {leap:.4g} s after that of the frame before: if the clock was set "
+                "there, correct the stamps; else nothing is known of the motion in that time"
+            )
         if not self._texture_warned:
             self._check_texture(frame.left, len(features))
         if not self._partners_explained and frame.right is not None:
@@ -97,6 +107,7 @@ class InputWarnings:
         if not 0 < interval < float("inf"):
             return  # a step refuses them
         if not SHORTEST <= interval <= LONGEST:
+            self._leapt = True
             guess = next((unit for unit, size in _UNITS if interval * size <= LONGEST), _UNITS[-1][0])
             what = f" (are they in {guess}?)" if interval > LONGEST else ""
             self._warn(f"stamps are {interval:.3g} s apart{what}: give them in seconds")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from slam.calibration import RigModel, RigPosterior
-from slam.calibration.posterior import SIGMAS, RigEvidence, factory_prior
+from slam.calibration.posterior import RigEvidence, factory_prior
 from slam.calibration.saved import CERTAIN, agreement, agreement_in_words, joint_calibration
 from slam.config import SystemConfig
 from slam.data import FrameResult
@@ -67,7 +67,8 @@ def calibrate(
         raise ConfigurationError("slam calibrate needs self_calibration.enabled=true")
     recordings, evidence = zip(*(_run(*each, frames, on_frame) for each in zip(sequences, configs)))
     model, known = RigModel(rig), [one for one in evidence if one is not None]
-    kept = joint_calibration(model, factory_prior(model), known)
+    prior = factory_prior(model)
+    kept = joint_calibration(model, prior, known)
     apart = agreement(model, known)
     pairs, unsolved = (sum(one[key] for one in recordings) for key in ("pairs", "unsolved_pairs"))
     warning, judgement, worth = "", "", False
@@ -86,7 +87,7 @@ def calibrate(
         judgement, worth = _judged(model, kept.posterior, configs[0].models.pixel_sigma, matched, apart)
     found = kept.to_json() | {
         "recordings": recordings,
-        "usual": [SIGMAS[name.removeprefix("left_").removeprefix("right_")] for name in model.names],
+        "usual": np.sqrt(np.diag(prior.covariances[-1])).tolist(),
         "apart": None if apart is None else apart.tolist(),
         "agreement": None if apart is None else agreement_in_words(apart),
         "judgement": judgement,
@@ -106,16 +107,17 @@ def _run(
     for _, result in system.run(sequence.frames(*frames)):
         on_frame(result)
         matched.append(len(result.matched))
-    own = system.calibration
+    own, evidence = system.calibration, system.calibration.evidence()
     found = {
         "sequence": sequence.name,
         "frames": len(matched),
         "matched": float(np.median(matched)) if matched else 0.0,  # landmarks found again in a frame
+        "left_out": evidence is None,
         "pairs": own.pairs,
         "unsolved_pairs": own.unsolved,
         "doubt": own.doubt,
     }
-    return found | own.kept().posterior.to_json(), own.evidence()
+    return found | own.kept().posterior.to_json(), evidence
 
 
 def _judged(

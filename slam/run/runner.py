@@ -73,6 +73,8 @@ def run(
     """
     require_outputs(options.outputs, overwrite=True)
     if options.record is not None:
+        if options.record.suffix.lower() != ".npz":
+            raise SlamError(f"{options.record}: a recording is a file of NumPy's: --record FILE.npz")
         if options.prior_map is not None:
             raise SlamError("a run that starts in a prior map cannot be recorded: the recording would lack the map")
         if options.config.map.monocular:
@@ -272,7 +274,9 @@ class _Run:
         no_path = scale_doubt(record, rig, driving)
         doubt = no_path or motion_doubt(record, options.config.models.motion, driving)
         dropped, recorded = self.live.dropped if self.live else 0, isinstance(self.sequence, Recording)
-        tracking = outcome(record, rig, options, warnings, dropped, doubt, recorded)
+        certain = getattr(self.system, "doubt", "")
+        causes = [certain, *warnings] if certain else warnings
+        tracking = outcome(record, rig, options, causes, dropped, doubt, recorded)
         if doubt and not tracking:
             logger.warning("%s", doubt)
         if isinstance(self.system, StereoSlam) and not self.system.doubt and self.system.calibration.warning:
@@ -281,7 +285,7 @@ class _Run:
             "frames": len(record.numbers),
             "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
             "tracking": tracking,
-            "doubt": getattr(self.system, "doubt", "") or no_path,
+            "doubt": certain or no_path,
             "warnings": [*self.sequence.warnings, *warnings, *([doubt] if doubt else [])],
             **({} if self.live is None else {"live": live_frames(self.live, record)}),
         }

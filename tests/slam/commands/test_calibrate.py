@@ -4,9 +4,11 @@ import json
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import slam
 from slam.calibration import RigModel, RigPosterior
+from slam.commands.cli import app
 from slam.errors import SlamError
 from slam.run.calibrating import _judged
 from tests.scripts import command
@@ -17,21 +19,24 @@ QUIET = ("-q", "--no-picture")
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """What two recordings of one rig leave, and what is printed."""
+    """What two recordings of one rig leave, what is printed, and the exit status."""
     folder = tmp_path_factory.mktemp("made")
-    return folder, command("calibrate", WORLD, f"{WORLD}&seed=1", "--out", folder / "rig.json")
+    done = CliRunner().invoke(app, ["calibrate", WORLD, f"{WORLD}&seed=1", "--out", str(folder / "rig.json")])
+    return folder, done.output, done.exit_code
 
 
 def test_two_recordings_of_one_rig(made):
-    folder, printed = made
+    folder, printed, status = made
     tree = json.loads((folder / "rig.json").read_text())
     assert [one["frames"] for one in tree["recordings"]] == [6, 6]
     turn = [row for row in tree["parameters"] if row["name"] in ("pitch", "yaw", "roll")]
     assert all(abs(row["mean"] + 1e-3) < 3 * row["sigma"] for row in turn)
     assert any(abs(row["mean"]) > 1e-4 for row in turn)
+    assert all(row["sigma"] < 1.01 * usual for row, usual in zip(tree["parameters"], tree["usual"], strict=True))
     assert tree["agreement"].startswith("The recordings agree")
     assert tree["agreement"] in " ".join(printed.split())
     assert not tree["judgement"] and "no two views" in tree["warnings"][0]  # a few frames say nothing of disparities
+    assert status == 1 and "left out" not in printed and "above" not in printed  # what their rows say is in the file
 
 
 @pytest.mark.parametrize(
@@ -56,7 +61,7 @@ def test_a_correction_is_advised_only_where_it_is_expected_to_help(off, sigma, a
 
 
 def test_it_is_the_prior_of_a_run(made, tmp_path):
-    folder, _ = made
+    folder = made[0]
     file = folder / "rig.json"
     command("run", WORLD, "--calibration", file, "--frames", "0:2", "--out", tmp_path / "first", *QUIET)
     found = json.loads((tmp_path / "first" / "summary.json").read_text())["self_calibration"]["parameters"]

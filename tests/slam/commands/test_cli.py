@@ -46,6 +46,7 @@ def test_a_recording_is_no_place_for_a_run(tmp_path):
         (["run", "synthetic:desk", "--set", "backend.colour=1"], "colour"),
         (["run", "synthetic:desk", "--frames", "40"], "A:B; 0:40 are the first 40"),
         (["run", "synthetic:desk?frames=3", "--frames", "7:9"], "7:9"),
+        (["run", "synthetic:desk", "--record", "tape.txt"], r"tape\.txt: .*--record FILE\.npz"),
         (["compare", "synthetic:desk", "--trials", 0], "trials must be 1 or more"),
     ],
 )

@@ -164,6 +164,10 @@ SAID = {
     "1 kHz": (every(8, interval=0.001), {}, ""),
     "2 Hz": (every(8, interval=0.5), {}, ""),
     "a gap": (stamped([0, 0.1, 0.2, 40.0, 40.1, 40.2, 40.3]), {}, ""),
+    "an hour": (
+        stamped(0.1 * np.arange(20) + 3600.0 * (np.arange(20) > 9) + 7200.0 * (np.arange(20) > 15)), {},
+        "^frame 10: its stamp is 3600 s after that of the frame before: if the clock was set there",
+    ),
     "no texture": (
         every(12), {"features": 3}, r"hardly anything to follow \(3 features in frame 4, grey values from "
     ),

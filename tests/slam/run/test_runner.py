@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from slam.atlas.map_io import load_map
 from slam.calibration.estimator import SelfCalibration
 from slam.commands.ending import Stopped, catch_signals, ended_by_signals
 from slam.config import SystemConfig
+from slam.data import StereoFeatures
 from slam.errors import SequenceError, SlamError
 from slam.geometry.trajectory import Trajectory
 from slam.run import schema
@@ -26,6 +28,7 @@ from slam.run.run_data import RunData
 from slam.run.run_record import RunRecord
 from slam.run.runner import run
 from slam.sequences import open_sequence
+from slam.system import StereoSlam
 from tests.failing_runs import FRAMES, Features, Scripted
 
 WORLD = "synthetic:aisle?frames=12"
@@ -57,6 +60,15 @@ def test_what_the_calibration_is_warned_of_is_said_and_kept(tmp_path, monkeypatc
     summary = run(open_sequence("synthetic:aisle?frames=2"), options(tmp_path))
     assert caplog.messages == summary["warnings"] == ["the images fit another focal length"]
     assert summary["doubt"] == "" == summary["tracking"]
+
+
+def test_why_no_path_can_be_trusted_is_the_cause_of_lost_frames(tmp_path, monkeypatch):
+    """Of images whose distortion the calibration leaves out it was the time between them."""
+    monkeypatch.setattr(StereoSlam, "doubt", "a lens distortion that is not in the calibration")
+    monkeypatch.setattr(StereoSlam, "warnings", ["frames are 0.8 s apart", StereoSlam.doubt])
+    nothing = SimpleNamespace(extract=lambda frame: StereoFeatures.empty(frame.stamp))
+    summary = run(open_sequence("synthetic:aisle?frames=3"), options(tmp_path), frontend=nothing)
+    assert summary["tracking"].endswith(f"likely cause: {summary['doubt']}")
 
 
 def test_a_run_leaves_its_files(tmp_path):
