@@ -8,7 +8,7 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from backends.ekf.camera import Camera, Motion, from_body_axes, pose_by_error, predicted, prior
-from backends.ekf.covariance import CAMERA, POSE, RECENT, Covariance, positive
+from backends.ekf.covariance import CAMERA, POSE, RECENT, positive
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
 from backends.ekf.solve import correction
@@ -109,7 +109,7 @@ class LandmarkFilter:
         T, P, rows = s.pose.copy(), s.pose_covariance(), s.landmarks.order
         if not landmarks:
             return Estimate(s.stamp, T, P, rows[:0], np.zeros((0, 3)), np.zeros((0, 3, 3)))
-        marks, own = s.landmarks.select(rows), s.covariance.marginals(rows)[0]
+        marks, own = s.landmarks.select(rows), s.marginals(rows)[0]
         D = self._coordinates.jacobian(marks.anchors, marks.c)
         C, summands = D @ own @ D.transpose(0, 2, 1), (D * D @ np.einsum("nii->ni", own)[:, :, None])[:, :, 0]
         blocks = positive(0.5 * (C + C.transpose(0, 2, 1)), summands, 9)
@@ -144,10 +144,12 @@ class LandmarkFilter:
         anchors[:, :, 3] = positions
         deviations = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         anchors[:, 2, 3] -= np.clip(_STAND_OFF * deviations, 1.0, _FARTHEST_ANCHOR)
-        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, -1)
-        new = changed(new, sights=np.full((len(ids), 3), np.nan), known=np.ones(len(ids), bool))
+        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, -1, s.covariance.by_rig.shape[1])
         D = new.gauge[:, :, :3]
-        self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
+        C = D @ covariances @ D.transpose(0, 2, 1)
+        unseen, known = np.full((len(ids), 3), np.nan), np.ones(len(ids), bool)
+        new = changed(new, sights=unseen, known=known, covariance=C, relative=C)
+        self.state = changed(s, landmarks=s.landmarks.joined(new))
 
     @one_blas_thread
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
@@ -167,14 +169,14 @@ class LandmarkFilter:
         if pose is not None:
             by_rig[:POSE] = np.linalg.solve(pose_by_error(s.camera), pose)
         self._measure = changed(self._measure, field=field)
-        self.state = changed(s, covariance=Covariance.of_camera(s.covariance.camera, by_rig))
+        self.state = FilterState.first(s.camera, s.covariance.camera, by_rig)
 
     def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
         """See `slam.interfaces.ConsideringBackend.sensitivities`."""
         s = self._started("sensitivities")
         rows = s.landmarks.rows_of(ids)
         D = self._coordinates.jacobian(s.landmarks.anchors[rows], s.landmarks.c[rows])
-        return pose_by_error(s.camera) @ s.covariance.by_rig[:POSE], D @ s.covariance.marginals(rows)[2]
+        return pose_by_error(s.camera) @ s.covariance.by_rig[:POSE], D @ s.marginals(rows)[2]
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
@@ -191,7 +193,7 @@ class LandmarkFilter:
         s, stereo = changed(self.state, measured=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
             rows = np.arange(len(s.landmarks))
-            marks = s.landmarks.select(~s.landmarks.known | (rows < s.covariance.correlated))
+            marks = s.landmarks.select(~s.landmarks.known | (rows < s.covariance.active))
             z, _ = stereo.project(se3.transform(se3.inverse(s.pose), marks.points))
             T = np.where(self.rig.left.in_image(z[:, :2])[:, None, None], s.pose[:3], marks.anchors)
             z, _ = stereo.project(((marks.points - T[:, :, 3])[:, None] @ T[:, :, :3])[:, 0])

@@ -52,9 +52,9 @@ class Update:
         return changed(self, camera=camera, covariance=self.covariance.camera_moved(J))
 
     @cached_property
-    def numbers(self) -> IndexArray:
+    def indices(self) -> IndexArray:
         """Where pose and coordinates of the measured landmarks (6 + 3M,) stand among the errors of the covariance."""
-        return np.append(np.arange(POSE), self.covariance.numbers(self.rows))
+        return np.append(np.arange(POSE), self.covariance.indices(self.rows))
 
     @cached_property
     def lever(self) -> Array:
@@ -68,14 +68,14 @@ class Update:
         A displacement U of the world is an error of the pose that takes the landmarks along by the lever. What U G x
         leaves of x is to be independent of it: ``G = (Uᵀ P⁻¹ U)⁻¹ Uᵀ P⁻¹``. None where P has lost its digits.
         """
-        root, info = dpotrf(self.covariance.P[self.numbers[:, None], self.numbers], lower=1)
+        root, info = dpotrf(self.covariance.P[self.indices[:, None], self.indices], lower=1)
         U = np.concatenate([np.eye(POSE), self.lever.reshape(-1, POSE)])
         Z = dpotrs(root, U, lower=1)[0] if info == 0 else np.full(U.shape, np.nan)
         return np.linalg.solve(U.T @ Z, Z.T) if np.isfinite(Z).all() else None
 
     def pixels_from(self, camera: Camera, change: Array) -> Array:
         """What a camera would measure (M, 3) [px] of landmarks if the state changes (n,); NaN behind it."""
-        marks, asked = self.landmarks, change[self.numbers[POSE:]].reshape(-1, 3)
+        marks, asked = self.landmarks, change[self.indices[POSE:]].reshape(-1, 3)
         points = self.coordinates.points(marks.anchors, self.coordinates.moved(marks.c, asked))
         return self.measure.stereo.project((points - camera.pose[:3, 3]) @ camera.pose[:3, :3])[0]
 
@@ -91,9 +91,9 @@ class Update:
             change[:CAMERA] = np.linalg.solve(J, there.minus(self.camera))
         if moved is not None:
             change[HEAD:] = moved
-            asked = change[self.numbers[POSE:]].reshape(-1, 3)
+            asked = change[self.indices[POSE:]].reshape(-1, 3)
             marks = marks.moved(self.coordinates, slice(None), asked)
-            change[self.numbers[POSE:]] = (marks.c - self.landmarks.c).reshape(-1)  # a coordinate may be at its limit
+            change[self.indices[POSE:]] = (marks.c - self.landmarks.c).reshape(-1)  # a coordinate may be at its limit
         R, r = there.pose[:3, :3], there.pose[:3, 3]
         z, by_point = self.measure.stereo.project((marks.points - r) @ R)
         seen = np.isfinite(self.z) & np.isfinite(z).all(axis=1, keepdims=True)
@@ -146,17 +146,17 @@ class Linearisation:
     def nu(self) -> Array:
         """Innovation (3M,) of the prior's mean: ``ν = z − h(x) + H x`` with the change x from the prior to here."""
         left = np.where(self.seen, self.update.z - self.z, 0.0).reshape(-1)
-        return np.asarray(left + self.H_times(self.change[self.update.numbers, None])[:, 0])
+        return np.asarray(left + self.H_times(self.change[self.update.indices, None])[:, 0])
 
     @cached_property
     def HP(self) -> Array:
         """``H P`` (3M, n), with everything."""
-        return self.H_times(self.update.covariance.P[self.update.numbers])
+        return self.H_times(self.update.covariance.P[self.update.indices])
 
     @cached_property
     def S(self) -> Array:
         """``S = H P Hᵀ + R`` (3M, 3M)."""
-        S = self.H_times(self.HP[:, self.update.numbers].T)
+        S = self.H_times(self.HP[:, self.update.indices].T)
         S[np.diag_indices(len(S))] += self.update.sigma**2
         return S
 
@@ -226,7 +226,7 @@ class Correction:
         """
         at, update = self.at, self.at.update
         V = dtrmm(1.0, self.L_inverse.T, at.HP[self.taken].T, side=1, overwrite_b=1)
-        by_rig = at.H_times(update.covariance.by_rig[update.numbers])
+        by_rig = at.H_times(update.covariance.by_rig[update.indices])
         by_rig -= np.where(at.seen[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
         return V, V @ self.white(by_rig)
 

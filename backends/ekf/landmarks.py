@@ -49,15 +49,6 @@ class InverseDepth:
         D[:, 2, 2] = -depth * depth
         return np.asarray(anchors[:, :, :3] @ D)
 
-    def inverse_jacobian(self, anchors: Array, c: Array) -> Array:
-        """Derivatives (M, 3, 3) of the coordinates by the positions."""
-        w = c[:, 2]
-        D = np.zeros((len(c), 3, 3))
-        D[:, 0, 0] = D[:, 1, 1] = w
-        D[:, :2, 2] = -c[:, :2] * w[:, None]
-        D[:, 2, 2] = -w * w
-        return np.asarray(D @ np.swapaxes(anchors[:, :, :3], 1, 2))
-
     def moved(self, c: Array, change: Array) -> Array:
         """Coordinates of points after a change of c (M, 3); of an inverse depth at least a share `_LEFT` is left.
 
@@ -82,8 +73,6 @@ class Euclidean:
     def jacobian(self, anchors: Array, c: Array) -> Array:  # noqa: D102
         return np.tile(np.eye(3), (len(c), 1, 1))
 
-    inverse_jacobian = jacobian
-
     def moved(self, c: Array, change: Array) -> Array:  # noqa: D102
         return c + change
 
@@ -97,7 +86,11 @@ COORDINATES: dict[str, Coordinates] = {"inverse_depth": InverseDepth(), "euclide
 
 @dataclass(frozen=True, eq=False)
 class FilterLandmarks(LandmarkRows):
-    """The map in rows, in the order of `backends.ekf.covariance.Covariance`."""
+    """The map in rows: first the landmarks in the state, in the order of `Covariance`, then the inactive ones.
+
+    These have left the state, or are known from elsewhere and not measured yet. They are independent of all else: what
+    is known of them stands in the last four columns, which mean nothing for those in the state. See `FilterState`.
+    """
 
     anchors: Array  # (N, 3, 4), constants
     c: Array  # coordinates (N, 3)
@@ -106,19 +99,27 @@ class FilterLandmarks(LandmarkRows):
     sights: Array  # lines of sight (N, 3) up to which the slide is counted, in the world; NaN where that is not known
     last: IndexArray  # number of the frame that measured it last (N,)
     known: BoolArray  # of a prior map (N,)
+    covariance: Array  # (N, 3, 3) of the coordinates
+    relative: Array  # (N, 3, 3) as seen from the reference pose that it left; of one that is known: the same
+    drift: Array  # covariance (N, 6, 6) of the way from that pose to the present reference pose
+    by_rig: Array  # derivatives (N, 3, m) of the coordinates by errors of the rig
 
     @classmethod
-    def at(cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array, frame: int) -> FilterLandmarks:
-        """New ones at positions (M, 3), seen from their anchors in a frame of that number."""
+    def at(
+        cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array, frame: int, m: int = 0
+    ) -> FilterLandmarks:
+        """New ones at positions (M, 3), seen from their anchors in a frame of that number; m errors of the rig."""
         c = coordinates.of(anchors, points)
         gauge, sights = gauge_jacobian(coordinates, anchors, c, points), points - anchors[:, :, 3]
         sights /= np.linalg.norm(sights, axis=1, keepdims=True)
-        return cls(ids, anchors, c, points, gauge, sights, np.full(len(ids), frame), np.zeros(len(ids), bool))
+        last, known = np.full(len(ids), frame), np.zeros(len(ids), bool)
+        none = (np.zeros((len(ids), *shape)) for shape in ((3, 3), (3, 3), (6, 6), (3, m)))
+        return cls(ids, anchors, c, points, gauge, sights, last, known, *none)
 
     @classmethod
-    def none(cls) -> FilterLandmarks:
-        """No landmarks."""
-        return cls.at(Euclidean(), np.zeros(0, np.int64), np.zeros((0, 3, 4)), np.zeros((0, 3)), -1)
+    def none(cls, m: int) -> FilterLandmarks:
+        """No landmarks, where m errors of the rig are considered."""
+        return cls.at(Euclidean(), np.zeros(0, np.int64), np.zeros((0, 3, 4)), np.zeros((0, 3)), -1, m)
 
     def moved(self, coordinates: Coordinates, rows: IndexArray | slice, change: Array) -> FilterLandmarks:
         """With a change (M, 3) of the coordinates of some rows."""
@@ -165,5 +166,5 @@ class Slide:
 
 def gauge_jacobian(coordinates: Coordinates, anchors: Array, c: Array, points: Array) -> Array:
     """Derivatives (M, 3, 6) of coordinates c (M, 3) by a displacement of the world; see `FilterLandmarks`."""
-    inverse = coordinates.inverse_jacobian(anchors, c)
-    return np.concatenate([inverse, -inverse @ hat(points)], axis=2)
+    by_world = np.concatenate([np.tile(np.eye(3), (len(c), 1, 1)), -hat(points)], axis=2)
+    return np.linalg.solve(coordinates.jacobian(anchors, c), by_world)

@@ -185,7 +185,7 @@ def _iterate(at: Linearisation, used: BoolArray) -> Correction:
 def _linear(found: Correction) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
     now, update = found.at, found.at.update
-    step = (found.change - now.change)[update.numbers]
+    step = (found.change - now.change)[update.indices]
     as_seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
     errors = update.pixels_from(found.camera, found.change) - now.z - (now.own @ as_seen[:, :, None])[:, :, 0]
     errors = np.where(now.seen & found.used[:, None], errors, 0.0)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from backends.ekf.camera import Camera, Motion, displacement, pose_by_error, transport
-from backends.ekf.covariance import HEAD, LEAVING, POSE, Apart, Covariance
+from backends.ekf.covariance import HEAD, LEAVING, POSE, Covariance
 from backends.ekf.innovation import Correction
 from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
 from slam.data import IdArray, IndexArray
@@ -40,12 +40,13 @@ class FilterState:
     measured: bool  # whether the pose may not be updated any more
     camera: Camera
     landmarks: FilterLandmarks  # all of them
-    covariance: Covariance  # of everything
+    covariance: Covariance  # of the camera and those in the state
 
     @classmethod
-    def first(cls, camera: Camera, P: Array) -> FilterState:
-        """Before the first prediction, with the covariance (12, 12) of the camera's error."""
-        return cls(float("nan"), -1, True, camera, FilterLandmarks.none(), Covariance.of_camera(P))
+    def first(cls, camera: Camera, P: Array, by_rig: Array | None = None) -> FilterState:
+        """Before the first prediction, with what `Covariance.of_camera` says of the camera's error."""
+        covariance = Covariance.of_camera(P, by_rig)
+        return cls(float("nan"), -1, True, camera, FilterLandmarks.none(covariance.by_rig.shape[1]), covariance)
 
     # --- the camera ---
 
@@ -66,15 +67,26 @@ class FilterState:
         covariance = self.covariance.advanced(J, noise, pose_by_error(self.camera))
         return FilterState(stamp, self.frame + 1, False, camera, self.landmarks, covariance)
 
+    def marginals(self, rows: IndexArray) -> tuple[Array, Array, Array]:
+        """Covariances (M, 3, 3) of landmarks, by rows of the table, and (M, 3, 6) with the camera's [r, φ].
+
+        The last are derivatives (M, 3, m) of their coordinates by errors of the rig.
+        """
+        marks, covariance, active = self.landmarks, self.covariance, rows < self.covariance.active
+        own, cross, by_rig = marks.covariance[rows], np.zeros((len(rows), 3, POSE)), marks.by_rig[rows]
+        at = covariance.indices(rows[active])
+        own[active], by_rig[active] = covariance.P[at[:, :, None], at[:, None, :]], covariance.by_rig[at]
+        cross[active] = covariance.P[at, :POSE]
+        return own, cross, by_rig
+
     def from_camera(self, rows: IndexArray) -> Array:
         """Covariances (M, 3, 3) of landmarks' errors, in their coordinates, as seen from the camera."""
-        (own, cross, _), G = self.covariance.marginals(rows), self.landmarks.gauge[rows]
-        B, count = G @ displacement(self.camera), self.covariance.correlated
-        seen = _as_seen(own, cross, self.covariance.pose, B)
-        left = (rows >= count) & ~self.landmarks.known[rows]
+        (own, cross, _), G, marks = self.marginals(rows), self.landmarks.gauge[rows], self.landmarks
+        seen = _as_seen(own, cross, self.covariance.pose, G @ displacement(self.camera))
+        left = (rows >= self.covariance.active) & ~marks.known[rows]
         if left.any():
-            apart, G = self.covariance.apart.select(rows[left] - count), G[left]
-            seen[left] = apart.seen + G @ (apart.way + self._way()) @ G.transpose(0, 2, 1)
+            gone, G = rows[left], G[left]
+            seen[left] = marks.relative[gone] + G @ (marks.drift[gone] + self._drift()) @ G.transpose(0, 2, 1)
         return seen
 
     def slid(self, slide: Slide, rows: IndexArray, r: Array) -> FilterState:
@@ -96,43 +108,40 @@ class FilterState:
         if not len(ids):
             return self
         R, anchors = self.pose[:3, :3], np.repeat(self.pose[None, :3], len(h), axis=0)
-        new = FilterLandmarks.at(coordinates, ids, anchors, self.pose[:3, 3] + h @ R.T, self.frame)
+        points, m = self.pose[:3, 3] + h @ R.T, self.covariance.by_rig.shape[1]
+        new = FilterLandmarks.at(coordinates, ids, anchors, points, self.frame, m)
         D, J = new.gauge[:, :, :3] @ R, new.gauge @ displacement(self.camera)
         moved = J @ self.covariance.by_rig[:POSE] + (0.0 if by_rig is None else D @ by_rig)
-        noise = _block_diagonal(D @ covariances @ D.transpose(0, 2, 1))
-        return changed(self, measured=True)._with(new, self.covariance.appended(J, noise, moved))
-
-    def inserted(self, new: FilterLandmarks, covariances: Array) -> FilterState:
-        """With landmarks known from elsewhere, by covariances (M, 3, 3) of their coordinates."""
-        return self._with_apart(new, Apart.known(covariances, self.covariance.by_rig.shape[1]))
+        covariance = self.covariance.appended(J, D @ covariances @ D.transpose(0, 2, 1), moved)
+        return changed(self, measured=True)._with(new, covariance)
 
     def removed(self, ids: IdArray) -> FilterState:
         """Without some landmarks (M,)."""
         return self._without(self.landmarks.rows_of(ids)) if len(ids) else self
 
     def with_all_of(self, ids: IdArray) -> FilterState:
-        """With some landmarks (M,), which may be apart, in the state.
+        """With some landmarks (M,), which may be inactive, in the state.
 
         Those that have left share the uncertainty of the camera's way since the later of two left. Those of a prior map
         are independent of the pose in the world.
         """
         rows = self.landmarks.rows_of(ids)
-        rows = np.sort(rows[rows >= self.covariance.correlated])  # in the order in which they left
+        rows = np.sort(rows[rows >= self.covariance.active])  # in the order in which they left
         if not len(rows):
             return self
-        apart, new = self.covariance.apart.select(rows - self.covariance.correlated), self.landmarks.select(rows)
+        new = self.landmarks.select(rows)
         G = np.where(new.known[:, None, None], 0.0, new.gauge)
-        way = (G @ (apart.way + self._way())).reshape(-1, POSE) @ G.reshape(-1, POSE).T
-        noise = _block_diagonal(apart.seen) + np.tril(way) + np.tril(way, -1).T
+        shared = (G @ (new.drift + self._drift())).reshape(-1, POSE) @ G.reshape(-1, POSE).T
+        shared, J = np.tril(shared) + np.tril(shared, -1).T, G @ displacement(self.camera)
         s = self._without(rows)
-        return s._with(new, s.covariance.appended(G @ displacement(self.camera), noise, apart.by_rig))
+        return s._with(new, s.covariance.appended(J, new.relative, new.by_rig, shared))
 
     def with_most(self, most: int) -> FilterState:
         """With so many landmarks in the state, at most, besides those of a prior map and those that are measured now.
 
         Those that were measured longest ago leave it.
         """
-        may = np.flatnonzero(~self.landmarks.known[: self.covariance.correlated])
+        may = np.flatnonzero(~self.landmarks.known[: self.covariance.active])
         if len(may) <= most:
             return self
         last = self.landmarks.last[may]
@@ -142,34 +151,33 @@ class FilterState:
 
     def _left_by(self, rows: IndexArray) -> FilterState:
         """After landmarks of some rows of the state leave the pose that others left last, or the present one."""
-        s, covariance, G, here = self, self.covariance, self.landmarks.gauge[rows], self.from_camera(rows)
-        own, _, by_rig = covariance.marginals(rows)
-        seen = _as_seen(own, covariance.P[covariance.numbers(rows), LEAVING], covariance.P[LEAVING, LEAVING], G)
-        if not len(covariance.apart) or np.trace(np.linalg.solve(here, seen), axis1=1, axis2=2).mean() > 3 * _AS_WELL:
-            s, seen = changed(self, covariance=covariance.leaving_here(displacement(self.camera))), here
-        left = Apart(own, seen, np.zeros((len(rows), POSE, POSE)), by_rig)
-        return s._without(rows)._with_apart(self.landmarks.select(rows), left)
+        s, P, G, seen = self, self.covariance.P, self.landmarks.gauge[rows], self.from_camera(rows)
+        (own, _, by_rig), cross = self.marginals(rows), P[self.covariance.indices(rows), LEAVING]
+        relative = _as_seen(own, cross, P[LEAVING, LEAVING], G)
+        first = len(self.landmarks) == self.covariance.active
+        if first or np.trace(np.linalg.solve(seen, relative), axis1=1, axis2=2).mean() > 3 * _AS_WELL:
+            marks = changed(self.landmarks, drift=self.landmarks.drift + self._drift())
+            covariance, relative = self.covariance.leaving_here(displacement(self.camera)), seen
+            s = changed(self, landmarks=marks, covariance=covariance)
+        left, none = self.landmarks.select(rows), np.zeros((len(rows), POSE, POSE))
+        left, s = changed(left, covariance=own, relative=relative, drift=none, by_rig=by_rig), s._without(rows)
+        return changed(s, landmarks=s.landmarks.joined(left))
 
-    def _way(self) -> Array:
-        """Covariance (6, 6) of the way from the pose that landmarks left last to the camera."""
+    def _drift(self) -> Array:
+        """Covariance (6, 6) of the way from the reference pose to the camera."""
         return self.covariance.way(displacement(self.camera))
 
     def _without(self, gone: IndexArray) -> FilterState:
         """Without the landmarks of some rows of the table."""
-        stays, count = np.delete(np.arange(len(self.landmarks)), gone), self.covariance.correlated
-        covariance = self.covariance.only(stays[stays < count], stays[stays >= count])
+        stays = np.delete(np.arange(len(self.landmarks)), gone)
+        covariance = self.covariance.only(stays[stays < self.covariance.active])
         return changed(self, landmarks=self.landmarks.select(stays), covariance=covariance)
 
     def _with(self, new: FilterLandmarks, covariance: Covariance) -> FilterState:
         """With new landmarks, the last ones of the state."""
-        end, marks = self.covariance.correlated, self.landmarks
+        end, marks = self.covariance.active, self.landmarks
         landmarks = marks.select(slice(end)).joined(new).joined(marks.select(slice(end, None)))
         return changed(self, landmarks=landmarks, covariance=covariance)
-
-    def _with_apart(self, new: FilterLandmarks, what: Apart) -> FilterState:
-        """With new landmarks that are apart."""
-        covariance = changed(self.covariance, apart=self.covariance.apart.joined(what))
-        return changed(self, landmarks=self.landmarks.joined(new), covariance=covariance)
 
     # --- updates ---
 
@@ -205,12 +213,14 @@ class FilterState:
         marks = before.moved(coordinates, rows, coordinates.of(before.anchors[rows], points) - before.c[rows])
         if not np.isfinite(marks.points).all():
             return self
-        covariance = self.covariance.displaced(rows, (marks.c - before.c)[rows], self._shift(marks, self.camera))
-        return changed(self, landmarks=marks, covariance=covariance)
+        change, active, by_rig = (marks.c - before.c)[rows], rows < self.covariance.active, marks.by_rig.copy()
+        by_rig[rows, :, -1:] -= change[:, :, None]
+        covariance = self.covariance.displaced(rows[active], change[active], self._shift(marks, self.camera))
+        return changed(self, landmarks=changed(marks, by_rig=by_rig), covariance=covariance)
 
     def _shift(self, marks: FilterLandmarks, camera: Camera) -> Array:
         """What is added to the errors (N, 3, 6) of landmarks that have moved, by the error of the pose."""
-        change = (marks.gauge - self.landmarks.gauge)[: self.covariance.correlated]
+        change = (marks.gauge - self.landmarks.gauge)[: self.covariance.active]
         return np.asarray(change @ displacement(camera) if camera.transports else np.zeros_like(change))
 
 
@@ -221,10 +231,3 @@ def _as_seen(own: Array, cross: Array, P: Array, B: Array) -> Array:
     """
     seen = own + (B @ P - 2 * cross) @ B.transpose(0, 2, 1)
     return np.asarray(0.5 * (seen + seen.transpose(0, 2, 1)))
-
-
-def _block_diagonal(blocks: Array) -> Array:
-    """A matrix (3M, 3M) of the blocks (M, 3, 3) on its diagonal."""
-    each, out = np.arange(len(blocks)), np.zeros((len(blocks), 3, len(blocks), 3))
-    out[each, :, each] = blocks
-    return out.reshape(3 * len(blocks), -1)

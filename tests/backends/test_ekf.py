@@ -100,9 +100,9 @@ def test_what_nothing_measures_stays_unknown(drive, make, options):
         for stamp, _, seen in list(data)[:25]:
             step(backend, stamp, seen, known)
         camera, marks = backend.state.camera, backend.state.landmarks
-        shift = np.zeros((12 + 3 * backend.state.covariance.correlated, 6))
+        shift = np.zeros((12 + 3 * backend.state.covariance.active, 6))
         shift[:6], shift[6:9, 3:] = np.linalg.inv(displacement(camera)), -se3.hat(camera.v)
-        shift[12:] = marks.gauge[: backend.state.covariance.correlated].reshape(-1, 6)
+        shift[12:] = marks.gauge[: backend.state.covariance.active].reshape(-1, 6)
         information = sigma**2 * shift.T @ np.linalg.solve(dense(backend.state.covariance), shift)
         learnt.append(np.diag(information))
     assert (learnt[0] < (1.01 if ekf else 1.001)).all()  # less than 1 where the model's impulses have loosened it

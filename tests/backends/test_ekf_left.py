@@ -44,7 +44,7 @@ def swayed(name: str, frames: int, seed: int = 0, considers: bool = False, **opt
 
 def left(state) -> np.ndarray:
     """Ids of the landmarks that have left the state."""
-    return state.landmarks.ids[state.covariance.correlated :]
+    return state.landmarks.ids[state.covariance.active :]
 
 
 @BOTH
@@ -55,8 +55,8 @@ def test_a_landmark_that_leaves_stays_where_it_is_and_as_uncertain(name):
     ids, J = whole.ids, backend.sensitivities(whole.ids)
     seen = s.from_camera(s.landmarks.rows_of(ids))
     backend.state = s = s.with_most(KEPT)
-    assert len(left(s)) > 50 and s.covariance.correlated <= KEPT
-    assert s.landmarks.last[s.covariance.correlated :].max() <= s.landmarks.last[: s.covariance.correlated].min()
+    assert len(left(s)) > 50 and s.covariance.active <= KEPT
+    assert s.landmarks.last[s.covariance.active :].max() <= s.landmarks.last[: s.covariance.active].min()
     after, rows = backend.estimate(), s.landmarks.rows_of(ids)
     np.testing.assert_array_equal(after.ids, ids)
     np.testing.assert_array_equal(after.positions, whole.positions)
@@ -74,8 +74,8 @@ def test_one_that_is_measured_again_is_new_to_the_camera(name):
     s, P = backend.state, backend.estimate(landmarks=False).covariance
     ids = left(s)
     rows = s.landmarks.rows_of(ids)
-    seen, apart = s.from_camera(rows), s.covariance.apart
-    assert (np.trace(seen - apart.seen, axis1=1, axis2=2) > 0).all()  # with the camera's way
+    seen, gone = s.from_camera(rows), s.landmarks.select(rows)
+    assert (np.trace(seen - gone.relative, axis1=1, axis2=2) > 0).all()  # with the camera's way
     J = backend.sensitivities(ids)[1]
     backend.state = s = s.with_all_of(ids)
     assert not len(left(s))
@@ -84,7 +84,7 @@ def test_one_that_is_measured_again_is_new_to_the_camera(name):
     np.testing.assert_allclose(backend.sensitivities(ids)[1], J)
     np.testing.assert_array_equal(backend.estimate(landmarks=False).covariance, P)
     # a measurement of them, however exact, says nothing of the camera
-    at = s.covariance.numbers(rows).ravel()
+    at = s.covariance.indices(rows).ravel()
     G, H = s.landmarks.gauge[rows], np.eye(len(s.covariance.P))[at]
     H[:, :6] = -(G @ displacement(s.camera)).reshape(-1, 6)
     np.testing.assert_allclose(H @ s.covariance.P[:, :6], 0, atol=1e-12)
@@ -92,7 +92,7 @@ def test_one_that_is_measured_again_is_new_to_the_camera(name):
     half = len(ids) // 2
     U, E = G[:half].reshape(-1, 6), H[: 3 * half]
     known = np.linalg.inv(U.T @ np.linalg.solve(E @ s.covariance.P @ E.T, U))
-    way = s.covariance.way(displacement(s.camera)) + apart.way[half - 1]
+    way = s.covariance.way(displacement(s.camera)) + gone.drift[half - 1]
     assert half > 50 and np.linalg.eigvals(np.linalg.solve(way, known)).real.min() > 1.0
 
 
@@ -202,7 +202,7 @@ def test_they_are_removed_and_those_of_a_prior_map_stay_in_the_state(name):
         known |= set(sights[k].ids.tolist())
     backend.predict(1.0)
     s = backend.state
-    inserted, state = s.landmarks.known, s.landmarks.last[: s.covariance.correlated]
+    inserted, state = s.landmarks.known, s.landmarks.last[: s.covariance.active]
     assert (s.landmarks.last[inserted] >= 0).sum() > 20
     assert set(s.landmarks.ids[: len(state)]) >= set(s.landmarks.ids[inserted & (s.landmarks.last >= 0)])
     assert set(left(s).tolist()) >= known - set(sights[3].ids.tolist())

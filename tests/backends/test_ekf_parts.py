@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from backends.ekf.backend import EkfConfig
 from backends.ekf.camera import displacement, from_body_axes, pose_by_error, predicted, prior
-from backends.ekf.covariance import CAMERA, HEAD, LEAVING, Apart, Covariance
+from backends.ekf.covariance import CAMERA, HEAD, LEAVING, Covariance
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth, Slide
 from backends.ekf.motion import EulerCamera
@@ -92,7 +92,7 @@ def test_a_step_in_pieces_has_the_noise_of_a_whole_one():
 def covariance_of(P: np.ndarray) -> Covariance:
     """Of a camera and landmarks with a joint covariance, and of no poses before."""
     P = np.insert(np.insert(P, [CAMERA] * (HEAD - CAMERA), 0.0, axis=0), [CAMERA] * (HEAD - CAMERA), 0.0, axis=1)
-    return Covariance(P, np.zeros((len(P), 0)), Apart.known(np.zeros((0, 3, 3)), 0))
+    return Covariance(P, np.zeros((len(P), 0)))
 
 
 # --- the landmarks' coordinates ---
@@ -115,43 +115,24 @@ def test_coordinates_there_and_back(coordinates):
 
 
 def grown(rng: np.random.Generator) -> tuple[Covariance, np.ndarray]:
-    """A camera whose last poses were known for certain, eleven landmarks in the state, three that are only known.
-
-    And the same as one matrix.
-    """
+    """A camera whose last poses were known for certain, eleven landmarks; and its matrix."""
     camera = positive(CAMERA, rng)
     J, noise = rng.standard_normal((11, 3, 6)), np.array([positive(3, rng) for _ in range(11)])
     F = np.concatenate([np.eye(HEAD, CAMERA), np.pad(J.reshape(-1, 6), ((0, 0), (0, 6)))])
-    P = F @ camera @ F.T
-    known = np.array([positive(3, rng) for _ in range(3)])
-    P = np.pad(P, (0, 9))
-    for i, block in enumerate([*noise, *known]):
-        rows = slice(HEAD + 3 * i, HEAD + 3 * i + 3)
-        P[rows, rows] += block
-    grown = Covariance.of_camera(camera).appended(J, block_diag(*noise), np.zeros((11, 3, 0)))
-    return replace(grown, apart=Apart.known(known, 0)), P
-
-
-def whole(covariance: Covariance) -> np.ndarray:
-    """All of it as one matrix."""
-    return block_diag(covariance.P, *covariance.apart.own)
+    P = F @ camera @ F.T + block_diag(np.zeros((HEAD, HEAD)), *noise)
+    return Covariance.of_camera(camera).appended(J, noise, np.zeros((11, 3, 0))), P
 
 
 def numbers(rows) -> np.ndarray:
     return np.concatenate([np.arange(HEAD), *[HEAD + 3 * r + np.arange(3) for r in rows]])
 
 
-def test_landmarks_move_between_the_parts():
+def test_landmarks_join_and_are_removed():
     covariance, P = grown(np.random.default_rng(4))
-    assert_equal_to_rounding(whole(covariance), P)
-    blocks, cross, _ = covariance.marginals(np.arange(14))
-    for i in range(14):
-        rows = slice(HEAD + 3 * i, HEAD + 3 * i + 3)
-        assert_equal_to_rounding(blocks[i], P[rows, rows])
-        assert_equal_to_rounding(cross[i], P[rows, :6])
-    parts = [1, 9, 10, 0, 2, 5, 8], [11, 13]
-    g = numbers([*parts[0], *parts[1]])
-    assert_equal_to_rounding(whole(covariance.only(*map(np.array, parts))), P[np.ix_(g, g)])
+    assert_equal_to_rounding(covariance.P, P)
+    kept = [1, 9, 10, 0, 2, 5, 8]
+    g = numbers(kept)
+    assert_equal_to_rounding(covariance.only(np.array(kept)).P, P[np.ix_(g, g)])
 
 
 def advanced(covariance: Covariance, P: np.ndarray, rng) -> tuple[Covariance, np.ndarray]:
@@ -174,10 +155,10 @@ def test_the_last_poses_are_kept():
     """Behind the camera, also where a landmark joins and one goes."""
     rng = np.random.default_rng(6)
     covariance, P = advanced(*grown(rng), rng)
-    assert_equal_to_rounding(whole(covariance), P)
-    g = numbers([0, 3, 4, 5, 6, 7, 8, 9, 10, 1, 11])
-    back = covariance.only(np.array([0, 3, 4, 5, 6, 7, 8, 9, 10, 1]), np.array([11]))
-    assert_equal_to_rounding(whole(back), P[np.ix_(g, g)])
+    assert_equal_to_rounding(covariance.P, P)
+    kept = [0, 3, 4, 5, 6, 7, 8, 9, 10, 1]
+    g, back = numbers(kept), covariance.only(np.array(kept))
+    assert_equal_to_rounding(back.P, P[np.ix_(g, g)])
     order = np.r_[18:24, 12:18, :6]
     assert_equal_to_rounding(back.joint_poses(np.eye(6), 3), P[np.ix_(order, order)])
     W = rng.standard_normal((6, 6))
@@ -200,7 +181,7 @@ def test_a_correction_and_its_transport():
     T[:CAMERA, :CAMERA] = J
     T[HEAD:m, :CAMERA] = K.reshape(-1, 6) @ J[:6]
     found = covariance.corrected(V, np.zeros((m, 0)), J, K)
-    assert_equal_to_rounding(whole(found), T @ expected @ T.T)
+    assert_equal_to_rounding(found.P, T @ expected @ T.T)
 
 
 # --- the filter's steps against the printed formulas ---

@@ -172,7 +172,7 @@ def test_a_landmark_in_contradiction_with_the_others_is_found(drive):
 def test_a_broken_covariance_is_a_status_with_a_reason(drive, entry, where):
     backend, seen = predicted(drive, 5)
     P = backend.state.covariance
-    broken, row = P.P.copy(), 1 if where == "pose" else P.numbers(backend.state.landmarks.rows_of(seen.ids[3:4]))[0, 0]
+    broken, row = P.P.copy(), 1 if where == "pose" else P.indices(backend.state.landmarks.rows_of(seen.ids[3:4]))[0, 0]
     broken[row, row] = entry
     backend.state = replace(backend.state, covariance=replace(P, P=broken))
     before = backend.state
