@@ -244,7 +244,7 @@ class LandmarkFilter:
         slid = s.slid(self._slide, rows, (s.pose if guess is None else guess)[:3, 3])
         update = Update(
             s.camera, slid.covariance, slid.landmarks.select(rows), rows, z, self._measure, self._coordinates,
-            self._iterations,
+            self._iterations, self._measure.limits(z),
         )  # fmt: skip
         update = update if guess is None else update.regular_towards(guess)
 

@@ -35,9 +35,10 @@ class Update:
     landmarks: FilterLandmarks  # those that were measured (M,); all are in the state
     rows: IndexArray  # their rows (M,) in the table of all
     z: Array  # measurements (M, 3) [px], NaN where a component is not measured
-    measure: RectifiedMeasurement  # what they measure, their noise, and the gate
+    measure: RectifiedMeasurement  # what they measure, and their noise
     coordinates: Coordinates
     iterations: int  # most linearisations
+    limits: Array  # of the gate (M,), on squared distances
 
     @property
     def sigma(self) -> float:
@@ -79,29 +80,26 @@ class Update:
         points = self.coordinates.points(marks.anchors, self.coordinates.moved(marks.c, asked))
         return self.measure.stereo.project((points - camera.pose[:3, 3]) @ camera.pose[:3, :3])[0]
 
-    def linearised(self, camera: Camera | None = None, moved: Array | None = None) -> Linearisation:
-        """Linearised at a camera and a change (3N,) of the state's landmarks, by default those of the prior.
+    def linearised(self, camera: Camera, moved: Array | None = None) -> Linearisation:
+        """Linearised at a camera and a change (3N,) of the state's landmarks, by default none.
 
         A landmark is at ``h = Rᵀ (Y − r)`` (paper B, Eqs. 3-5).
         """
-        there, marks = camera or self.camera, self.landmarks
-        J = np.eye(CAMERA) if camera is None else transport(self.camera, camera)
-        change = np.zeros(len(self.covariance.P))
-        if camera is not None:
-            change[:CAMERA] = np.linalg.solve(J, there.minus(self.camera))
+        marks, J, change = self.landmarks, transport(self.camera, camera), np.zeros(len(self.covariance.P))
+        change[:CAMERA] = np.linalg.solve(J, camera.minus(self.camera))
         if moved is not None:
             change[HEAD:] = moved
             asked = change[self.indices[POSE:]].reshape(-1, 3)
             marks = marks.moved(self.coordinates, slice(None), asked)
             change[self.indices[POSE:]] = (marks.c - self.landmarks.c).reshape(-1)  # a coordinate may be at its limit
-        R, r = there.pose[:3, :3], there.pose[:3, 3]
+        R, r = camera.pose[:3, :3], camera.pose[:3, 3]
         z, by_point = self.measure.stereo.project((marks.points - r) @ R)
         seen = np.isfinite(self.z) & np.isfinite(z).all(axis=1, keepdims=True)
         own = by_point @ (R.T @ self.coordinates.jacobian(marks.anchors, marks.c))
         own = np.where(seen[:, :, None], own, 0.0)
         # an error that is transported displaces the world by the same, wherever it is written
-        lever = marks.gauge @ displacement(self.camera if self.camera.transports else there)
-        return Linearisation(self, there, J, change, z, seen, own, lever)
+        lever = marks.gauge @ displacement(self.camera if camera.transports else camera)
+        return Linearisation(self, camera, J, change, z, seen, own, lever)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +157,18 @@ class Linearisation:
         S = self.H_times(self.HP[:, self.update.indices].T)
         S[np.diag_indices(len(S))] += self.update.sigma**2
         return S
+
+    @cached_property
+    def distances(self) -> Array:
+        """Squared distances (M,) of the innovations, of each landmark by itself; NaN where none is predicted.
+
+        Raises LinAlgError where S is not positive definite.
+        """
+        blocks = np.einsum("iaib->iab", self.S.reshape(len(self.z), 3, -1, 3))
+        found = squared_distances(self.nu.reshape(-1, 3), blocks)
+        if not np.isfinite(found).all():
+            raise np.linalg.LinAlgError("the predicted innovations are not finite or not positive definite")
+        return np.where(np.isfinite(self.z).all(axis=1), found, np.nan)
 
     def solved(self, used: BoolArray) -> Correction:
         """The update by some landmarks (mask (M,)). Raises LinAlgError if S is not positive definite."""
@@ -231,7 +241,7 @@ class Correction:
         return V, V @ self.white(by_rig)
 
     @cached_property
-    def distances(self) -> Array:
+    def conditional_distances(self) -> Array:
         """Squared distance (M,) of each landmark's measurement from what all others that are used predict.
 
         With ``y_j`` and ``Q_j = (S⁻¹)_jj`` in the rows j of a landmark that is used, its innovation is off by
