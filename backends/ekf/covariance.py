@@ -1,12 +1,11 @@
-"""The filter's covariance: of the camera, its last poses and the landmarks, one dense matrix.
+"""The filter's covariance: of the camera, clones of its past poses, and the landmarks, one dense matrix.
 
-The past poses are corrected no more: they stay as they were believed in their time (stochastic clones). Their errors'
-covariance with the others goes on, as in the filter of Schmidt, which is exact for what it does: with a gain of zero
-``P_ab ← (1 − K H) P_ab`` and ``P_bb`` stays. They are the last poses, and the one that landmarks left.
+The clones are not corrected: they stay as they were estimated in their time. Their covariance with the others goes on,
+as in a Schmidt filter: with a gain of zero ``P_ab ← (1 − K H) P_ab``, and their own ``P_bb`` stays. They are the last
+poses, and the reference pose of landmarks that have left the state (`backends.ekf.state`).
 
-Errors of the rig (`slam.interfaces.ConsideringBackend`) are considered, too, but not estimated. What is kept are the
-derivatives of all errors by them, which the same gain moves: a landmark's measurement is off by ``H x − F δ``, with a
-field F. Their own covariance is not needed here.
+Errors δ of the rig (`slam.interfaces.ConsideringBackend`) are consider parameters. Kept are the derivatives of all
+errors by them, which the same gain changes: a measurement is off by ``H x − F δ``, with the rig's field F.
 """
 
 from __future__ import annotations
@@ -23,19 +22,19 @@ from slam.runtime.compilation import kernel
 
 CAMERA = 12  #: fixed: size of the camera's state [r, φ, v, ω]
 POSE = 6  #: fixed: its part [r, φ] that measurements depend on
-RECENT = 4  #: cost: poses before the present one that are kept
-HEAD = CAMERA + POSE * (RECENT + 1)  #: fixed: size of camera and past poses, behind which the landmarks stand
-LEAVING = slice(HEAD - POSE, HEAD)  #: fixed: where the last of these stands, the pose that landmarks left
+CLONES = 4  #: cost: clones of the last poses before the present one
+HEAD = CAMERA + POSE * (CLONES + 1)  #: fixed: size of camera and clones, behind which the landmarks stand
+REFERENCE = slice(HEAD - POSE, HEAD)  #: fixed: where the last clone stands, the reference pose
 _BLOCK = 32  # cost: rows and columns that are mirrored at once
 
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Of ``[camera (12), last poses (24), the pose that landmarks left (6), N landmarks (3N)]``, n numbers.
+    """Of ``[camera (12), last poses (24), reference pose (6), N landmarks (3N)]``, with n rows.
 
-    The last poses are perturbed on the right, the newest first; zero before there are so many. The error of the pose
-    that landmarks left is a displacement of the world, zero (the world itself) before one has left; see
-    `backends.ekf.state.FilterState`. The landmarks are the first of the table of all, in its order.
+    The last poses are perturbed on the right, the newest first; zero before there are so many. The error of the
+    reference pose is a displacement of the world; zero, the world itself, before a landmark has left the state. The
+    landmarks are the first of the table of all, in its order.
     """
 
     P: Array  # (n, n)
@@ -63,7 +62,7 @@ class Covariance:
         return self.P[:POSE, :POSE]
 
     def indices(self, rows: IndexArray) -> IndexArray:
-        """Where the coordinates (M, 3) of landmarks stand, by rows of the table."""
+        """Indices (M, 3) of the coordinates of landmarks, by rows of the table."""
         return np.asarray(HEAD + 3 * rows[:, None] + np.arange(3))
 
     def joint_poses(self, J: Array, n: int) -> Array:
@@ -89,22 +88,22 @@ class Covariance:
         return changed(self, P=P, by_rig=by_rig)
 
     def advanced(self, J: Array, noise: Array, by_error: Array) -> Covariance:
-        """The same; `by_error` (6, 6) times [r, φ], the pose before, is the first of the last ones; the oldest goes."""
+        """The same, and the pose before, `by_error` (6, 6) times [r, φ], becomes the newest clone; the oldest goes."""
         F = np.eye(HEAD, k=-POSE)
-        F[:CAMERA, :CAMERA], F[LEAVING], F[LEAVING, LEAVING] = J, 0.0, np.eye(POSE)
+        F[:CAMERA, :CAMERA], F[REFERENCE], F[REFERENCE, REFERENCE] = J, 0.0, np.eye(POSE)
         F[CAMERA : CAMERA + POSE, :CAMERA] = np.pad(by_error, ((0, 0), (0, POSE)))
         return self.camera_moved(F, noise)
 
-    def leaving_here(self, W: Array) -> Covariance:
-        """The pose that landmarks leave is the present one now; its error W (6, 6) times [r, φ] displaces the world."""
+    def with_reference(self, W: Array) -> Covariance:
+        """With the present pose as the reference pose; W (6, 6) is its `gauge_by_error`."""
         F = np.eye(HEAD)
-        F[LEAVING, LEAVING], F[LEAVING, :POSE] = 0.0, W
+        F[REFERENCE, REFERENCE], F[REFERENCE, :POSE] = 0.0, W
         return self.camera_moved(F)
 
-    def way(self, W: Array) -> Array:
-        """Of the change (6,) of the displacement of the world from the pose that landmarks left until now, W [r, φ]."""
-        D = W @ self.P[:POSE, LEAVING]
-        D = W @ self.pose @ W.T - D - D.T + self.P[LEAVING, LEAVING]
+    def drift(self, W: Array) -> Array:
+        """Covariance (6, 6) of the drift from the reference pose to the present one, a displacement of the world."""
+        D = W @ self.P[:POSE, REFERENCE]
+        D = W @ self.pose @ W.T - D - D.T + self.P[REFERENCE, REFERENCE]
         return np.asarray(0.5 * (D + D.T))
 
     def walked(self, rows: IndexArray, walk: Array) -> Covariance:
@@ -141,15 +140,15 @@ class Covariance:
     def corrected(self, V: Array, by_rig: Array, J: Array, shift: Array) -> Covariance:
         """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ`` (paper A, Eq. 11).
 
-        The past poses keep the covariance that they have among themselves.
+        The clones keep the covariance that they have among themselves.
 
         Args:
             V: ``K S Kᵀ = V Vᵀ`` (n, ·).
-            by_rig: what errors of the rig change in the update (n, m), as derivatives.
+            by_rig: by which derivatives by errors of the rig fall (n, m).
             J: the corrected camera's error is J (12, 12) times that of the camera before.
             shift: the error of a corrected landmark is what it was plus its shift (N, 3, 6) times that of the pose.
         """
-        last, by_rig, D = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), CAMERA))
+        clones, by_rig, D = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), CAMERA))
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
         mirror(P, CAMERA)
         D[:CAMERA], D[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
@@ -157,21 +156,11 @@ class Covariance:
         half = 0.5 * D @ P[:CAMERA, :CAMERA]
         P = dsyr2k(1.0, D, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
         by_rig += D @ by_rig[:CAMERA]
-        P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]
+        P[clones, clones], by_rig[clones] = self.P[clones, clones], self.by_rig[clones]
         summands = self.P.diagonal() + 2 * (half * D).sum(axis=1)
-        summands[last] = 0.0
+        summands[clones] = 0.0
         mirror(P, len(P))
         return changed(self, P=positive(P, summands, V.shape[1]), by_rig=by_rig)
-
-    def displaced(self, rows: IndexArray, change: Array, shift: Array) -> Covariance:
-        """After a change (M, 3) of some landmarks' coordinates that is none of their error, with a shift as above.
-
-        It is that of the last of the rig's errors, which is known to be 1 (`slam.interfaces.ConsideringBackend`).
-        """
-        by_rig = self.by_rig.copy()
-        by_rig[self.indices(rows), -1:] -= change[:, :, None]
-        nothing = np.zeros((len(self.P), 0))
-        return changed(self, by_rig=by_rig).corrected(nothing, 0 * by_rig, np.eye(CAMERA), shift)
 
 
 @kernel

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from backends.ekf.camera import Camera, Motion, from_body_axes, pose_by_error, predicted, prior
-from backends.ekf.covariance import CAMERA, POSE, RECENT, positive
+from backends.ekf.camera import Camera, from_body_axes, pose_by_error, prior
+from backends.ekf.covariance import CAMERA, CLONES, POSE, positive
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
 from backends.ekf.solve import correction
@@ -45,7 +45,7 @@ class LandmarkFilter:
         stereo: whether the right pixel is measured.
 
     Attributes:
-        state: what is believed now. Each call makes a new one beside it, which takes its place at the end of the call.
+        state: the estimate. Each call makes a new one beside it, which takes its place at the end of the call.
     """
 
     name: str
@@ -70,12 +70,12 @@ class LandmarkFilter:
     @one_blas_thread
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
-        return self._moved_on(stamp, rests=False)
+        return self._predict(stamp, rests=False)
 
     @one_blas_thread
     def predict_at_rest(self, stamp: float) -> Prediction:
         """See `slam.interfaces.RestingBackend.predict_at_rest`."""
-        return self._moved_on(stamp, rests=True)
+        return self._predict(stamp, rests=True)
 
     @one_blas_thread
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
@@ -83,7 +83,7 @@ class LandmarkFilter:
         s = self._started("update")
         require_not_measured(self.name, s.measured)
         require_guess(self.name, guess)
-        s = changed(s.with_all_of(observations.ids), measured=True)
+        s = changed(s.with_active(observations.ids), measured=True)
         s, report = self._updated(s, observations, guess)
         self.state = s
         return report
@@ -96,7 +96,7 @@ class LandmarkFilter:
         stereo = self._measure.stereo
         farthest = stereo.f * stereo.baseline / _DISPARITY
         new = self._measure.first_sight(observations.ids, stereo.measure(observations), farthest)
-        self.state = s.placed(self._coordinates, observations.ids, *new)
+        self.state = s.augmented(self._coordinates, observations.ids, *new)
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`."""
@@ -120,16 +120,16 @@ class LandmarkFilter:
         return self.state.landmarks.points[self.state.landmarks.rows_of(ids)]
 
     def trajectory(self) -> Trajectory:
-        """See `slam.interfaces.Backend.trajectory`: what was believed at each stamp, never revised."""
+        """See `slam.interfaces.Backend.trajectory`: what was estimated at each stamp, never revised."""
         return Trajectory(*self._path())
 
     def recent(self, n: int) -> RecentPoses:
-        """The last n poses, at most five, as believed in their time; see `slam.data.RecentPoses`.
+        """The last n poses, at most five, as estimated in their time; see `slam.data.RecentPoses`.
 
         Raises MeasurementError before the first `predict`, or where n is less than one.
         """
         s = self._started("recent")
-        n = min(require_recent(self.name, n), s.frame + 1, RECENT + 1)
+        n = min(require_recent(self.name, n), s.frame + 1, CLONES + 1)
         return RecentPoses(*self._path(n), s.covariance.joint_poses(pose_by_error(s.camera), n))
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
@@ -147,8 +147,8 @@ class LandmarkFilter:
         new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, -1, s.covariance.by_rig.shape[1])
         D = new.gauge[:, :, :3]
         C = D @ covariances @ D.transpose(0, 2, 1)
-        unseen, known = np.full((len(ids), 3), np.nan), np.ones(len(ids), bool)
-        new = changed(new, sights=unseen, known=known, covariance=C, relative=C)
+        unseen, yes = np.full((len(ids), 3), np.nan), np.ones(len(ids), bool)
+        new = changed(new, sights=unseen, known=yes, covariance=C, relative=C)
         self.state = changed(s, landmarks=s.landmarks.joined(new))
 
     @one_blas_thread
@@ -156,7 +156,7 @@ class LandmarkFilter:
         """See `slam.interfaces.MapBackend.place`."""
         s = self._started("place")
         known = known_landmarks(self.name, s.landmarks, ids, local, covariances, True)
-        self.state = s.placed(self._coordinates, *known)
+        self.state = s.augmented(self._coordinates, *known)
 
     # --- errors of the rig (documented in slam.interfaces.ConsideringBackend) ---
 
@@ -201,7 +201,7 @@ class LandmarkFilter:
             local = stereo.triangulate(stereo.corrected(self.name, z[rows], correct))
             points = (T[rows, :, :3] @ local[:, :, None])[:, :, 0] + T[rows, :, 3]
             good = np.isfinite(points).all(axis=1)
-            s = s.displaced(self._coordinates, marks.ids[rows[good]], points[good])
+            s = s.revised(self._coordinates, marks.ids[rows[good]], points[good])
         self.state = s
 
     # --- the filter's parts ---
@@ -213,19 +213,16 @@ class LandmarkFilter:
         path = [*before, (s.stamp, s.pose)] if s.frame >= 0 else []
         return np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4)
 
-    def _moved_on(self, stamp: float, rests: bool) -> Prediction:
-        """Go to a time, and say what is in the angle of view then; whether the camera rests meanwhile."""
-        s = self.state if self._kept is None else self.state.with_most(self._kept)
+    def _predict(self, stamp: float, rests: bool) -> Prediction:
+        """Predict the state and what is in the angle of view; whether the camera rests meanwhile."""
+        s = self.state if self._kept is None else self.state.with_most_active(self._kept)
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
-        motion: Motion = s.camera, np.eye(CAMERA), np.zeros((CAMERA, CAMERA))
-        if s.frame >= 0:
-            motion = predicted(s.camera, self.models, s.covariance.camera, stamp - s.stamp, rests)
-        T = motion[0].pose
+        after = s.advanced(float(stamp), self.models, rests)
+        T = after.pose
         rows = self._measure.visible(T, s.landmarks.points)
-        after = s.advanced(float(stamp), motion)
         marks, walk = after.landmarks.select(rows), self._slide.walked(after.landmarks, rows, T[:3, 3])[1]
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
-        local = toward @ (after.from_camera(rows) + walk) @ toward.transpose(0, 2, 1)
+        local = toward @ (after.relative_covariances(rows) + walk) @ toward.transpose(0, 2, 1)
         left, right, S = self._measure.pixels((marks.points - T[:3, 3]) @ T[:3, :3], local)
         prediction = Prediction(after.stamp, T.copy(), after.pose_covariance(), marks.ids, left, right, S)
         self._past[after.frame - 1 :] = [(s.stamp, s.pose)] if after.frame else []

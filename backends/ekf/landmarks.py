@@ -20,7 +20,7 @@ from slam.geometry.se3 import Array, hat
 from slam.models import EstimatorModels
 
 _FARTHEST = 1e-6  # numerics: least inverse depth [1/m]
-_LEFT = 0.1  # share of its inverse depth that a landmark keeps at least in an update
+_KEPT_SHARE = 0.1  # share of its inverse depth that a landmark keeps at least in an update
 _UNCOUNTED = 0.1  # cost: variance of a slide that is not counted yet, as a share of the noise of a pixel
 _ASIDE = 1e3  # guard: largest |x/z|, |y/z|; 89.9 degrees from the axis of the camera that saw it first
 
@@ -49,15 +49,24 @@ class InverseDepth:
         D[:, 2, 2] = -depth * depth
         return np.asarray(anchors[:, :, :3] @ D)
 
-    def moved(self, c: Array, change: Array) -> Array:
-        """Coordinates of points after a change of c (M, 3); of an inverse depth at least a share `_LEFT` is left.
+    def inverse_jacobian(self, anchors: Array, c: Array) -> Array:
+        """Derivatives (M, 3, 3) of the coordinates by the positions."""
+        w = c[:, 2]
+        D = np.zeros((len(c), 3, 3))
+        D[:, 0, 0] = D[:, 1, 1] = w
+        D[:, :2, 2] = -c[:, :2] * w[:, None]
+        D[:, 2, 2] = -w * w
+        return np.asarray(D @ np.swapaxes(anchors[:, :, :3], 1, 2))
+
+    def plus(self, c: Array, change: Array) -> Array:
+        """Coordinates of points after a change of c (M, 3); of an inverse depth at least a share `_KEPT_SHARE` is left.
 
         The measurements of a far point may want its inverse depth negative: then it goes away, step by step. Nor does
         a step, which has no meaning so far from where it is linear, put it beside the camera that saw it first.
         """
         out, aside = c + change, np.maximum(np.abs(c[:, :2]), _ASIDE)
         out[:, :2] = np.clip(out[:, :2], -aside, aside)
-        out[:, 2] = np.maximum(out[:, 2], np.maximum(_LEFT * c[:, 2], _FARTHEST))
+        out[:, 2] = np.maximum(out[:, 2], np.maximum(_KEPT_SHARE * c[:, 2], _FARTHEST))
         return np.asarray(out)
 
 
@@ -73,7 +82,9 @@ class Euclidean:
     def jacobian(self, anchors: Array, c: Array) -> Array:  # noqa: D102
         return np.tile(np.eye(3), (len(c), 1, 1))
 
-    def moved(self, c: Array, change: Array) -> Array:  # noqa: D102
+    inverse_jacobian = jacobian
+
+    def plus(self, c: Array, change: Array) -> Array:  # noqa: D102
         return c + change
 
 
@@ -88,8 +99,8 @@ COORDINATES: dict[str, Coordinates] = {"inverse_depth": InverseDepth(), "euclide
 class FilterLandmarks(LandmarkRows):
     """The map in rows: first the landmarks in the state, in the order of `Covariance`, then the inactive ones.
 
-    These have left the state, or are known from elsewhere and not measured yet. They are independent of all else: what
-    is known of them stands in the last four columns, which mean nothing for those in the state. See `FilterState`.
+    These have left the state, or are of a prior map and not measured yet. The last four columns are of them alone, and
+    mean nothing for those in the state. See `FilterState`.
     """
 
     anchors: Array  # (N, 3, 4), constants
@@ -100,8 +111,8 @@ class FilterLandmarks(LandmarkRows):
     last: IndexArray  # number of the frame that measured it last (N,)
     known: BoolArray  # of a prior map (N,)
     covariance: Array  # (N, 3, 3) of the coordinates
-    relative: Array  # (N, 3, 3) as seen from the reference pose that it left; of one that is known: the same
-    drift: Array  # covariance (N, 6, 6) of the way from that pose to the present reference pose
+    relative: Array  # (N, 3, 3) relative to the reference pose when it left; of one that is known: the same
+    drift: Array  # covariance (N, 6, 6) of the drift from that pose to the present reference pose
     by_rig: Array  # derivatives (N, 3, m) of the coordinates by errors of the rig
 
     @classmethod
@@ -125,7 +136,7 @@ class FilterLandmarks(LandmarkRows):
         """With a change (M, 3) of the coordinates of some rows."""
         c, points, gauge, last = self.c.copy(), self.points.copy(), self.gauge.copy(), self.last.copy()
         anchors = self.anchors[rows]
-        c[rows] = coordinates.moved(self.c[rows], change)
+        c[rows] = coordinates.plus(self.c[rows], change)
         points[rows] = coordinates.points(anchors, c[rows])
         gauge[rows] = gauge_jacobian(coordinates, anchors, c[rows], points[rows])
         return changed(self, c=c, points=points, gauge=gauge, last=last)
@@ -133,9 +144,9 @@ class FilterLandmarks(LandmarkRows):
 
 @dataclass(frozen=True)
 class Slide:
-    """How features slide: from elsewhere the image looks like it at another point of the surface.
+    """How features slide: seen from elsewhere, a feature is found at another point of the surface.
 
-    A landmark's direction walks at random with the angle between its lines of sight.
+    A landmark's direction is a random walk over the angle between its lines of sight.
     """
 
     density: float  # standard deviation of the direction [rad / √rad], over the root of the angle; 0: none slides
@@ -150,7 +161,7 @@ class Slide:
         return cls(density / f, *angles.tolist())
 
     def walked(self, marks: FilterLandmarks, rows: IndexArray, r: Array) -> tuple[FilterLandmarks, Array]:
-        """Landmarks of which some rows (M,) are seen from r (3,), and by what covariance (M, 3, 3) those walk."""
+        """Landmarks of which some rows (M,) are seen from r (3,), and the covariances (M, 3, 3) of their walk."""
         if not self.density:
             return marks, np.zeros((len(rows), 3, 3))
         sight, sights, D = marks.points[rows] - r, marks.sights.copy(), marks.gauge[rows, :, :3]
@@ -166,5 +177,5 @@ class Slide:
 
 def gauge_jacobian(coordinates: Coordinates, anchors: Array, c: Array, points: Array) -> Array:
     """Derivatives (M, 3, 6) of coordinates c (M, 3) by a displacement of the world; see `FilterLandmarks`."""
-    by_world = np.concatenate([np.tile(np.eye(3), (len(c), 1, 1)), -hat(points)], axis=2)
-    return np.linalg.solve(coordinates.jacobian(anchors, c), by_world)
+    inverse = coordinates.inverse_jacobian(anchors, c)
+    return np.concatenate([inverse, -inverse @ hat(points)], axis=2)

@@ -63,11 +63,11 @@ class EulerCamera:
         return self.x[6:9]
 
     @cached_property
-    def turning(self) -> Array:
+    def attitude_jacobian(self) -> Array:
         """See `Camera`."""
         return np.asarray(self.pose[:3, :3] @ body_rate_matrix(self.x[3:6]))
 
-    def moved(self, error: Array) -> EulerCamera:
+    def plus(self, error: Array) -> EulerCamera:
         """See `Camera`."""
         return replace(self, x=self.x + error)
 
@@ -95,7 +95,7 @@ class EulerCamera:
         for piece in range(pieces):
             phi_y, rate = camera.x[[4, 10]]
             if max(abs(phi_y), abs(phi_y + rate * dt / pieces)) > LIMIT:
-                camera, G = camera.reanchored(camera.pose)
+                camera, G = camera.with_new_angles(camera.pose)
                 J = G @ J
                 W = G @ W if piece else W
             camera, A = camera._transition(dt / pieces)
@@ -115,7 +115,7 @@ class EulerCamera:
         A[:POSE, POSE:] = dt * np.eye(POSE)
         after = replace(self, x=A @ self.x)
         if self.transports:
-            A[3:6, 3:6] = np.linalg.solve(after.turning, self.turning)
+            A[3:6, 3:6] = np.linalg.solve(after.attitude_jacobian, self.attitude_jacobian)
         return after, A
 
     def stopped(self) -> EulerCamera:
@@ -125,9 +125,9 @@ class EulerCamera:
     def regular_towards(self, T: Array) -> tuple[EulerCamera, Array]:
         """See `Camera`."""
         sine = self.R_world_angles[:, 2] @ T[:3, 0]  # −sin φy
-        return self.reanchored(T) if abs(sine) > math.sin(LIMIT) else (self, np.eye(CAMERA))
+        return self.with_new_angles(T) if abs(sine) > math.sin(LIMIT) else (self, np.eye(CAMERA))
 
-    def reanchored(self, T: Array) -> tuple[EulerCamera, Array]:
+    def with_new_angles(self, T: Array) -> tuple[EulerCamera, Array]:
         """In a new angles' world, chosen for its attitude; and the Jacobian (12, 12) of its numbers by the old.
 
         Its y is the camera's right, its z across the right of both this and a pose T (4, 4): φy is zero there, too; or,

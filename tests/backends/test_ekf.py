@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from backends.ekf import EkfBackend
-from backends.ekf.camera import displacement
+from backends.ekf.camera import gauge_by_error
 from backends.ekf.camera import predicted as motion
 from backends.iekf import IekfBackend
 from backends.iekf.filter import InvariantCamera
@@ -101,7 +101,7 @@ def test_what_nothing_measures_stays_unknown(drive, make, options):
             step(backend, stamp, seen, known)
         camera, marks = backend.state.camera, backend.state.landmarks
         shift = np.zeros((12 + 3 * backend.state.covariance.active, 6))
-        shift[:6], shift[6:9, 3:] = np.linalg.inv(displacement(camera)), -se3.hat(camera.v)
+        shift[:6], shift[6:9, 3:] = np.linalg.inv(gauge_by_error(camera)), -se3.hat(camera.v)
         shift[12:] = marks.gauge[: backend.state.covariance.active].reshape(-1, 6)
         information = sigma**2 * shift.T @ np.linalg.solve(dense(backend.state.covariance), shift)
         learnt.append(np.diag(information))
@@ -236,7 +236,7 @@ def test_the_motion_and_its_derivatives():
     np.testing.assert_allclose(camera.pose[:3, 3], T[:3, 3] + dt * start.v, atol=1e-12)
 
     def moved(xi):
-        return start.moved(xi).advanced(dt)[0].minus(camera)
+        return start.plus(xi).advanced(dt)[0].minus(camera)
 
     np.testing.assert_allclose(J, jacobian(moved, np.zeros(12)), atol=1e-8)
 

@@ -220,7 +220,7 @@ def test_a_roll_in_one_step(make, degrees):
 def test_of_two_agreements_of_minorities_the_larger_counts(monkeypatch):
     agreeing = iter([4, 1])
     found = lambda _: SimpleNamespace(used=np.arange(12) < next(agreeing))  # noqa: E731
-    monkeypatch.setattr("backends.ekf.solve._agreed", found)
+    monkeypatch.setattr("backends.ekf.solve._plausible", found)
     camera, covariance = SimpleNamespace(pose=np.eye(4), at=lambda T: T), SimpleNamespace(P=np.eye(3))
     update = SimpleNamespace(camera=camera, covariance=covariance, z=np.zeros((12, 3)), linearised=lambda camera: None)
     assert correction(update, np.eye(4), lambda: None).used.sum() == 4
