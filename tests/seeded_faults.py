@@ -73,7 +73,7 @@ FAULTS = (
     ),
     Fault(
         "landmarks start without their measurement's noise", "backends/ekf/covariance.py",
-        "own = cross[:, :POSE] @ by_pose.T + noise", "own = cross[:, :POSE] @ by_pose.T + 0 * noise",
+        "[each, :, each] += noise", "[each, :, each] += 0 * noise",
     ),
     Fault(
         "one wrong match takes out its neighbours", "backends/ekf/solve.py",

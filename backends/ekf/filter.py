@@ -63,7 +63,8 @@ class LandmarkFilter:
         self._measure = RectifiedMeasurement(rig, models.with_slide())
         self._slide = Slide.of(models, self._measure.stereo.f)
         self.state = FilterState.first(camera, from_body_axes(camera, prior(models)))
-        self._past: list[tuple[float, Array]] = []  # stamps and poses before the state's
+        # stamps and poses before the state's, by the number of the frame; behind those are some of steps not taken
+        self._past: list[tuple[float, Array]] = []
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
 

@@ -4,7 +4,7 @@ The papers hold a landmark's position in the world. A stereo pair's noise is Gau
 of a far point goes with one over the disparity: in metres that is no Gaussian at all, and a filter that takes it for
 one is biased and too sure of itself. `InverseDepth` describes the same point by what a camera at its first sight would
 measure, ``[x/z, y/z, 1/z]``; that camera (the landmark's anchor) is a constant, wherever the true one was, so that the
-state has three numbers a landmark as before and everything else stays as it is. Simulated drives with points at 10 to
+state has three coordinates a landmark as before and everything else stays as it is. Simulated drives, points at 10 to
 60 m: NEES 6.3 instead of 9.8, position error 24 mm instead of 36.
 """
 
@@ -88,7 +88,7 @@ class Euclidean:
         return c + change
 
 
-#: What three numbers of the state say of a landmark.
+#: What three coordinates of the state say of a landmark.
 Coordinates = InverseDepth | Euclidean
 
 #: By the name of the option.

@@ -40,7 +40,7 @@ LIMIT = np.pi / 4
 
 @dataclass(frozen=True, eq=False)
 class EulerCamera:
-    """The papers' [r, φ, v, ω]: position, Euler angles, and their rates; the error is that of these numbers."""
+    """The papers' [r, φ, v, ω]: position, Euler angles, and their rates; the error is that of these 12."""
 
     x: Array  # (12,) [m], [rad], [m/s], [rad/s]
     R_world_angles: Array  # the angles' world (3, 3), see the module
@@ -106,7 +106,7 @@ class EulerCamera:
         """``x ← f(x)`` as printed, and A: as printed if the covariance is not transported.
 
         If the covariance is transported, the attitude's error is carried as a turn about the world's axes, not as one
-        of the angles φ, and the rates' error is that of the body's rate, in numbers of the angles' rates: a turn of the
+        of the angles φ, and the rates' error is that of the body's rate, as rates of the angles: a turn of the
         world leaves it as it is. The printed transition has constant rates of the angles, which is not the same in
         another world. As printed, A is the derivative of f, but the covariance would shrink along turns of the world,
         which nothing measures, in every step.
@@ -128,7 +128,7 @@ class EulerCamera:
         return self.with_new_angles(T) if abs(sine) > math.sin(LIMIT) else (self, np.eye(CAMERA))
 
     def with_new_angles(self, T: Array) -> tuple[EulerCamera, Array]:
-        """In a new angles' world, chosen for its attitude; and the Jacobian (12, 12) of its numbers by the old.
+        """In a new angles' world, chosen for its attitude; and the Jacobian (12, 12) of its error by the old.
 
         Its y is the camera's right, its z across the right of both this and a pose T (4, 4): φy is zero there, too; or,
         where both look alike, the camera's down.

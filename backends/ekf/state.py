@@ -87,11 +87,11 @@ class FilterState:
         """Covariances (M, 3, 3) of landmarks' errors, in their coordinates, relative to the camera."""
         (own, cross, _), gauge, marks = self.marginals(rows), self.landmarks.gauge[rows], self.landmarks
         relative = _relative(own, cross, self.covariance.pose, gauge @ gauge_by_error(self.camera))
-        left = (rows >= self.covariance.active) & ~marks.known[rows]
-        if left.any():
-            gone, gauge = rows[left], gauge[left]
-            drift = marks.drift[gone] + self._drift()
-            relative[left] = marks.relative[gone] + gauge @ drift @ gauge.transpose(0, 2, 1)
+        inactive = (rows >= self.covariance.active) & ~marks.known[rows]
+        if inactive.any():
+            left, gauge = rows[inactive], gauge[inactive]
+            drift = marks.drift[left] + self._drift()
+            relative[inactive] = marks.relative[left] + gauge @ drift @ gauge.transpose(0, 2, 1)
         return relative
 
     def slid(self, slide: Slide, rows: IndexArray, r: Array) -> FilterState:

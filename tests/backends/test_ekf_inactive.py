@@ -43,7 +43,7 @@ def swayed(name: str, frames: int, seed: int = 0, considers: bool = False, **opt
 
 
 def inactive(state) -> np.ndarray:
-    """Ids of the landmarks that have left the state."""
+    """Ids of the inactive landmarks."""
     return state.landmarks.ids[state.covariance.active :]
 
 
