@@ -112,7 +112,7 @@ class FilterLandmarks(LandmarkRows):
     known: BoolArray  # of a prior map (N,)
     covariance: Array  # (N, 3, 3) of the coordinates
     relative: Array  # (N, 3, 3) relative to the reference pose when it left; of one that is known: the same
-    drift: Array  # covariance (N, 6, 6) of the drift from that pose to the present reference pose
+    reference: IndexArray  # number of that pose (N,); see `FilterState.drifts`
     by_rig: Array  # derivatives (N, 3, m) of the coordinates by errors of the rig
 
     @classmethod
@@ -123,9 +123,9 @@ class FilterLandmarks(LandmarkRows):
         c = coordinates.of(anchors, points)
         gauge, sights = gauge_jacobian(coordinates, anchors, c, points), points - anchors[:, :, 3]
         sights /= np.linalg.norm(sights, axis=1, keepdims=True)
-        last, known = np.full(len(ids), frame), np.zeros(len(ids), bool)
-        none = (np.zeros((len(ids), *shape)) for shape in ((3, 3), (3, 3), (6, 6), (3, m)))
-        return cls(ids, anchors, c, points, gauge, sights, last, known, *none)
+        last, known, reference = np.full(len(ids), frame), np.zeros(len(ids), bool), np.zeros(len(ids), np.intp)
+        none, by_rig = np.zeros((len(ids), 3, 3)), np.zeros((len(ids), 3, m))
+        return cls(ids, anchors, c, points, gauge, sights, last, known, none, none, reference, by_rig)
 
     @classmethod
     def none(cls, m: int) -> FilterLandmarks:

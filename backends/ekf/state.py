@@ -42,12 +42,14 @@ class FilterState:
     camera: Camera
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of the camera and those in the state
+    drifts: Array  # covariances (K, 6, 6) of the drift from each reference pose to the present one, the last of them
 
     @classmethod
     def first(cls, camera: Camera, P: Array, by_rig: Array | None = None) -> FilterState:
         """Before the first prediction, with what `Covariance.of_camera` says of the camera's error."""
-        covariance = Covariance.of_camera(P, by_rig)
-        return cls(float("nan"), -1, True, camera, FilterLandmarks.none(covariance.by_rig.shape[1]), covariance)
+        covariance, drifts = Covariance.of_camera(P, by_rig), np.zeros((1, POSE, POSE))
+        marks = FilterLandmarks.none(covariance.by_rig.shape[1])
+        return cls(float("nan"), -1, True, camera, marks, covariance, drifts)
 
     # --- the camera ---
 
@@ -69,7 +71,7 @@ class FilterState:
             motion = predicted(self.camera, models, self.covariance.camera, stamp - self.stamp, rests)
         camera, A, noise = motion
         covariance = self.covariance.advanced(A, noise, pose_by_error(self.camera))
-        return FilterState(stamp, self.frame + 1, False, camera, self.landmarks, covariance)
+        return FilterState(stamp, self.frame + 1, False, camera, self.landmarks, covariance, self.drifts)
 
     def marginals(self, rows: IndexArray) -> tuple[Array, Array, Array]:
         """Covariances (M, 3, 3) of landmarks, by rows of the table, and (M, 3, 6) with the camera's [r, φ].
@@ -90,8 +92,8 @@ class FilterState:
         inactive = (rows >= self.covariance.active) & ~marks.known[rows]
         if inactive.any():
             left, gauge = rows[inactive], gauge[inactive]
-            drift = marks.drift[left] + self._drift()
-            relative[inactive] = marks.relative[left] + gauge @ drift @ gauge.transpose(0, 2, 1)
+            drifts = self._drifts(marks.reference[left])
+            relative[inactive] = marks.relative[left] + gauge @ drifts @ gauge.transpose(0, 2, 1)
         return relative
 
     def slid(self, slide: Slide, rows: IndexArray, r: Array) -> FilterState:
@@ -135,7 +137,7 @@ class FilterState:
             return self
         new = self.landmarks.select(rows)
         gauge = np.where(new.known[:, None, None], 0.0, new.gauge)
-        shared = (gauge @ (new.drift + self._drift())).reshape(-1, POSE) @ gauge.reshape(-1, POSE).T
+        shared = (gauge @ self._drifts(new.reference)).reshape(-1, POSE) @ gauge.reshape(-1, POSE).T
         shared, s = np.tril(shared) + np.tril(shared, -1).T, self._without(rows)
         N = gauge @ gauge_by_error(self.camera)
         return s._with(new, s.covariance.appended(N, new.relative, new.by_rig, shared))
@@ -160,16 +162,18 @@ class FilterState:
         first = len(self.landmarks) == self.covariance.active
         relative = _relative(own, cross, P[REFERENCE, REFERENCE], gauge)
         if first or np.trace(np.linalg.solve(here, relative), axis1=1, axis2=2).mean() > 3 * _AS_WELL:
-            marks = changed(self.landmarks, drift=self.landmarks.drift + self._drift())
+            used, reference = np.unique(self.landmarks.reference, return_inverse=True)
+            marks = changed(self.landmarks, reference=reference)
+            drifts = np.concatenate([self._drifts(used), np.zeros((1, POSE, POSE))])
             covariance, relative = self.covariance.with_reference(gauge_by_error(self.camera)), here
-            s = changed(self, landmarks=marks, covariance=covariance)
-        left, none = self.landmarks.select(rows), np.zeros((len(rows), POSE, POSE))
-        left, s = changed(left, covariance=own, relative=relative, drift=none, by_rig=by_rig), s._without(rows)
+            s = changed(self, landmarks=marks, covariance=covariance, drifts=drifts)
+        left, reference = self.landmarks.select(rows), np.full(len(rows), len(s.drifts) - 1)
+        left, s = changed(left, covariance=own, relative=relative, reference=reference, by_rig=by_rig), s._without(rows)
         return changed(s, landmarks=s.landmarks.joined(left))
 
-    def _drift(self) -> Array:
-        """Covariance (6, 6) of the drift from the reference pose to the camera."""
-        return self.covariance.drift(gauge_by_error(self.camera))
+    def _drifts(self, references: IndexArray) -> Array:
+        """Covariances (M, 6, 6) of the drift from some reference poses (M,) to the camera."""
+        return self.drifts[references] + self.covariance.drift(gauge_by_error(self.camera))
 
     def _without(self, gone: IndexArray) -> FilterState:
         """Without the landmarks of some rows of the table."""

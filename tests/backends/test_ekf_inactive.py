@@ -92,7 +92,7 @@ def test_one_that_is_measured_again_is_new_to_the_camera(name):
     half = len(ids) // 2
     U, E = G[:half].reshape(-1, 6), H[: 3 * half]
     known = np.linalg.inv(U.T @ np.linalg.solve(E @ s.covariance.P @ E.T, U))
-    way = s.covariance.drift(gauge_by_error(s.camera)) + gone.drift[half - 1]
+    way = s.covariance.drift(gauge_by_error(s.camera)) + s.drifts[gone.reference[half - 1]]
     assert half > 50 and np.linalg.eigvals(np.linalg.solve(way, known)).real.min() > 1.0
 
 
