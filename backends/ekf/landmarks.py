@@ -134,12 +134,12 @@ class FilterLandmarks(LandmarkRows):
 
     def moved(self, coordinates: Coordinates, rows: IndexArray | slice, change: Array) -> FilterLandmarks:
         """With a change (M, 3) of the coordinates of some rows."""
-        c, points, gauge, last = self.c.copy(), self.points.copy(), self.gauge.copy(), self.last.copy()
+        c, points, gauge = self.c.copy(), self.points.copy(), self.gauge.copy()
         anchors = self.anchors[rows]
         c[rows] = coordinates.plus(self.c[rows], change)
         points[rows] = coordinates.points(anchors, c[rows])
         gauge[rows] = gauge_jacobian(coordinates, anchors, c[rows], points[rows])
-        return changed(self, c=c, points=points, gauge=gauge, last=last)
+        return changed(self, c=c, points=points, gauge=gauge)
 
 
 @dataclass(frozen=True)

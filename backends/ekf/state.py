@@ -200,9 +200,9 @@ class FilterState:
         Bonnabel, 2015). Raises LinAlgError where the new state is not finite, or a variance is lost in rounding.
         """
         update, camera = found.at.update, found.camera
-        change = found.change[HEAD:].reshape(-1, 3)
-        marks = self.landmarks.moved(update.coordinates, slice(len(change)), change)
-        marks.last[update.rows[found.used]] = self.frame
+        change, last = found.change[HEAD:].reshape(-1, 3), self.landmarks.last.copy()
+        last[update.rows[found.used]] = self.frame
+        marks = changed(self.landmarks, last=last).moved(update.coordinates, slice(len(change)), change)
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise LinAlgError("the corrected state is not finite")
         J, shift = transport(update.camera, camera), self._shift(marks, camera)
