@@ -45,7 +45,7 @@ class Fault(NamedTuple):
 #: By how a file's path begins: the tests nearest to it.
 NEAREST = {
     "backends/ekf": "tests/backends/test_ekf_parts.py tests/backends/test_ekf.py tests/backends/test_ekf_robustness.py "
-    "tests/backends/test_ekf_left.py",
+    "tests/backends/test_ekf_inactive.py",
     "backends/smoother": "tests/backends/test_insert.py tests/backends/test_all_backends.py "
     "tests/backends/test_smoother.py tests/backends/test_contract.py",
     "backends/window": "tests/backends/test_window.py tests/backends/test_insert.py",
@@ -60,11 +60,12 @@ FAULTS = (
     # the filter
     Fault(
         "turning the camera moves points the wrong way", "backends/ekf/camera.py",
-        "hat(camera.pose[:3, 3]) @ turning, turning", "-hat(camera.pose[:3, 3]) @ turning, -turning",
+        "hat(camera.pose[:3, 3]) @ J, J", "-hat(camera.pose[:3, 3]) @ J, -J",
     ),
     Fault(
-        "the last poses are corrected as if they were in the state", "backends/ekf/covariance.py",
-        "P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]", "by_rig[last] = self.by_rig[last]",
+        "clones are corrected as if they were in the state", "backends/ekf/covariance.py",
+        "P[clones, clones], by_rig[clones] = self.P[clones, clones], self.by_rig[clones]",
+        "by_rig[clones] = self.by_rig[clones]",
     ),
     Fault(
         "no process noise", "backends/ekf/covariance.py",
@@ -72,7 +73,7 @@ FAULTS = (
     ),
     Fault(
         "landmarks start without their measurement's noise", "backends/ekf/covariance.py",
-        "own = cross[:, :POSE] @ by_pose.T + noise", "own = cross[:, :POSE] @ by_pose.T + 0 * noise",
+        "[each, :, each] += noise", "[each, :, each] += 0 * noise",
     ),
     Fault(
         "one wrong match takes out its neighbours", "backends/ekf/solve.py",

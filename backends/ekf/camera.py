@@ -1,9 +1,10 @@
 """What a filter asks of its camera, and what all cameras share: the prior, and the noise of a motion.
 
-An error is what is true less what is believed: adding it corrects. The camera's (12,) is of its pose (6), velocity (3)
-and rate (3), in numbers that each camera chooses. An error of the pose is as if the whole world were displaced: by how
-much says `displacement`. What a displacement of the world changes in a landmark's coordinates is ``gauge`` of
-`backends.ekf.landmarks`; the product says how an error of the pose moves landmarks that the camera takes along.
+An error is what is true less what is estimated: adding it corrects. The camera's (12,) is of its pose (6), velocity (3)
+and rate (3), in coordinates that each camera chooses. What no measurement tells (the gauge) are displacements of the
+world with the camera and all landmarks: a small shift, and a turn about the origin. `gauge_by_error` says which one is
+an error of the pose, ``gauge`` of `backends.ekf.landmarks.FilterLandmarks` what it changes in a landmark's coordinates.
+Their product N says how landmarks change with an error of the pose, if they stay where they are relative to the camera.
 """
 
 from __future__ import annotations
@@ -33,18 +34,18 @@ class Camera(Protocol):
         """Velocity (3,) in the world [m/s]."""
 
     @property
-    def turning(self) -> Array:
-        """Derivative (3, 3) of the attitude, turned about the world's axes, by its three numbers in the error."""
+    def attitude_jacobian(self) -> Array:
+        """Derivative (3, 3) of a turn about the world's axes by the error's three coordinates of the attitude."""
 
     @property
     def transports(self) -> bool:
         """Whether the covariance is transported to a corrected state; see `FilterState.corrected`."""
 
-    def moved(self, error: Array) -> Self:
-        """After an error (12,) is corrected."""
+    def plus(self, error: Array) -> Self:
+        """With an error (12,) added: ⊞."""
 
     def minus(self, other: Self) -> Array:
-        """The error (12,) that would bring the other camera here."""
+        """The error (12,) that, added to the other camera, gives this one: ⊟."""
 
     def at(self, T: Array) -> Self:
         """At another pose (4, 4), with the same velocities."""
@@ -65,43 +66,39 @@ class Camera(Protocol):
 def pose_by_error(camera: Camera) -> Array:
     """Derivative (6, 6) of the pose's right perturbation [rotation, translation] by the pose's error."""
     J, back = np.zeros((POSE, POSE)), camera.pose[:3, :3].T
-    J[:3, 3:], J[3:, :3] = back @ camera.turning, back
+    J[:3, 3:], J[3:, :3] = back @ camera.attitude_jacobian, back
     return J
 
 
-def displacement(camera: Camera) -> Array:
-    """The displacement W (6, 6) of the world [shift, turn about its origin] that is an error of the pose."""
-    W, turning = np.eye(POSE), camera.turning
-    W[:3, 3:], W[3:, 3:] = hat(camera.pose[:3, 3]) @ turning, turning
+def gauge_by_error(camera: Camera) -> Array:
+    """Derivative W (6, 6) of the displacement of the world [shift, turn about its origin] by the pose's error."""
+    W, J = np.eye(POSE), camera.attitude_jacobian
+    W[:3, 3:], W[3:, 3:] = hat(camera.pose[:3, 3]) @ J, J
     return W
 
 
 def transport(camera: Camera, to: Camera) -> Array:
-    """An error as one of another camera (12, 12): the same displacement of the world, ``W(to) J = W``.
+    """Jacobian J (12, 12) of an error written at another camera: the same displacement of the world, ``W(to) J = W``.
 
-    If the camera does not transport, the same numbers.
+    The identity if the camera does not transport.
     """
     J = np.eye(CAMERA)
     if camera.transports:
-        turning, shift = camera.turning, camera.pose[:3, 3] - to.pose[:3, 3]
-        J[3:6, 3:6] = np.linalg.solve(to.turning, turning)
-        J[:3, 3:6], J[6:9, 3:6] = hat(shift) @ turning, hat(camera.v - to.v) @ turning
+        turn, shift = camera.attitude_jacobian, camera.pose[:3, 3] - to.pose[:3, 3]
+        J[3:6, 3:6] = np.linalg.solve(to.attitude_jacobian, turn)
+        J[:3, 3:6], J[6:9, 3:6] = hat(shift) @ turn, hat(camera.v - to.v) @ turn
     return J
 
 
 def from_body_axes(camera: Camera, P: Array) -> Array:
     """A covariance (12, 12) with turns and rates about the body's axes, the same about all, as one of the error."""
     E = np.eye(CAMERA)
-    E[3:6, 3:6] = E[9:, 9:] = np.linalg.solve(camera.turning, camera.pose[:3, :3])
+    E[3:6, 3:6] = E[9:, 9:] = np.linalg.solve(camera.attitude_jacobian, camera.pose[:3, :3])
     return np.asarray(E @ P @ E.T)
 
 
-#: A camera that has moved; its error is a matrix (12, 12) times what it was, plus noise of a covariance (12, 12).
-Motion = tuple[Camera, Array, Array]
-
-
-def predicted(camera: Camera, models: EstimatorModels, P: Array, dt: float, rests: bool) -> Motion:
-    """A camera with the error's covariance P (12, 12), after `dt` [s]: ``A P Aᵀ + W Q Wᵀ`` (paper B, section 2).
+def predicted(camera: Camera, models: EstimatorModels, P: Array, dt: float, rests: bool) -> tuple[Camera, Array, Array]:
+    """A camera with the error's covariance P (12, 12), after `dt` [s]; A (12, 12), and ``W Q Wᵀ`` (paper B, section 2).
 
     One that rests keeps its pose, and its velocity is zero for certain. One that may have turned anyhow meanwhile stays
     where it is, as uncertain as the prior of the speed makes it, by `ANYWHERE` at most: more, in one gap, would mean

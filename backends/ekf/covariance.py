@@ -1,14 +1,11 @@
-"""The filter's covariance: of the camera, its last poses and the landmarks, one dense matrix.
+"""The filter's covariance: of the camera, clones of its past poses, and the landmarks, one dense matrix.
 
-The past poses are corrected no more: they stay as they were believed in their time (stochastic clones). Their errors'
-covariance with the others goes on, as in the filter of Schmidt, which is exact for what it does: with a gain of zero
-``P_ab ← (1 − K H) P_ab`` and ``P_bb`` stays. They are the last poses, and the one that landmarks left.
-Landmarks that are independent of all else until they are measured are apart from the matrix: those that are known from
-elsewhere, and those that were measured so long ago that they have left it.
+The clones are not corrected: they stay as they were estimated in their time. Their covariance with the others goes on,
+as in a Schmidt filter: with a gain of zero ``P_ab ← (1 − K H) P_ab``, and their own ``P_bb`` stays. They are the last
+poses, and the reference pose of landmarks that have left the state (`backends.ekf.state`).
 
-Errors of the rig (`slam.interfaces.ConsideringBackend`) are considered, too, but not estimated. What is kept are the
-derivatives of all errors by them, which the same gain moves: a landmark's measurement is off by ``H x − F δ``, with a
-field F. Their own covariance is not needed here.
+Errors δ of the rig (`slam.interfaces.ConsideringBackend`) are consider parameters. Kept are the derivatives of all
+errors by them, which the same gain changes: a measurement is off by ``H x − F δ``, with the rig's field F.
 """
 
 from __future__ import annotations
@@ -19,56 +16,39 @@ import numpy as np
 from scipy.linalg.blas import dsyr2k, dsyrk
 
 from slam.data import IndexArray
-from slam.geometry.arrays import Table, changed
+from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array
 from slam.runtime.compilation import kernel
 
 CAMERA = 12  #: fixed: size of the camera's state [r, φ, v, ω]
 POSE = 6  #: fixed: its part [r, φ] that measurements depend on
-RECENT = 4  #: cost: poses before the present one that are kept
-HEAD = CAMERA + POSE * (RECENT + 1)  #: fixed: size of camera and past poses, behind which the landmarks stand
-LEAVING = slice(HEAD - POSE, HEAD)  #: fixed: where the last of these stands, the pose that landmarks left
+CLONES = 4  #: cost: clones of the last poses before the present one
+HEAD = CAMERA + POSE * (CLONES + 1)  #: fixed: size of camera and clones, behind which the landmarks stand
+REFERENCE = slice(HEAD - POSE, HEAD)  #: fixed: where the last clone stands, the reference pose
 _BLOCK = 32  # cost: rows and columns that are mirrored at once
 
 
 @dataclass(frozen=True, eq=False)
-class Apart(Table):
-    """What is known of the coordinates of landmarks (C,) that are independent of all else."""
-
-    own: Array  # covariances (C, 3, 3)
-    seen: Array  # of those that have left, covariances (C, 3, 3) of the error as seen from a pose that they left
-    way: Array  # and of the way from that to the last such pose (C, 6, 6); see `backends.ekf.state.FilterState`
-    by_rig: Array  # derivatives (C, 3, m) by errors of the rig
-
-    @classmethod
-    def known(cls, own: Array, m: int) -> Apart:
-        """Landmarks that are known from elsewhere."""
-        return cls(own, own, np.zeros((len(own), POSE, POSE)), np.zeros((len(own), 3, m)))
-
-
-@dataclass(frozen=True, eq=False)
 class Covariance:
-    """Of ``[camera (12), last poses (24), the pose that landmarks left (6), N landmarks (3N)]``, n numbers.
+    """Of ``[camera (12), last poses (24), reference pose (6), N landmarks (3N)]``, with n rows.
 
-    The last poses are perturbed on the right, the newest first; zero before there are so many. The error of the pose
-    that landmarks left is a displacement of the world, zero (the world itself) before one has left; see
-    `backends.ekf.state.FilterState`. Rows of landmarks are in this order; behind them are those that are apart.
+    The last poses are perturbed on the right, the newest first; zero before there are so many. The error of the
+    reference pose is a displacement of the world; zero, the world itself, before a landmark has left the state. The
+    landmarks are the first of the table of all, in its order.
     """
 
     P: Array  # (n, n)
     by_rig: Array  # derivatives (n, m) of all errors by those of the rig
-    apart: Apart
 
     @classmethod
     def of_camera(cls, P: Array, by_rig: Array | None = None) -> Covariance:
         """Of the camera alone (12, 12), with derivatives (12, m) of its error by errors of the rig."""
         by_rig, more = np.zeros((CAMERA, 0)) if by_rig is None else by_rig, (0, HEAD - CAMERA)
-        none = Apart.known(np.zeros((0, 3, 3)), by_rig.shape[1])
-        return cls(np.pad(P, more), np.pad(by_rig, (more, (0, 0))), none)
+        return cls(np.pad(P, more), np.pad(by_rig, (more, (0, 0))))
 
     @property
-    def correlated(self) -> int:
-        """N: the landmarks after these are apart."""
+    def active(self) -> int:
+        """N: as many landmarks are in the state."""
         return (len(self.P) - HEAD) // 3
 
     @property
@@ -81,22 +61,9 @@ class Covariance:
         """Of its [r, φ] (6, 6)."""
         return self.P[:POSE, :POSE]
 
-    def numbers(self, rows: IndexArray) -> IndexArray:
-        """Where the coordinates (M, 3) of landmarks stand, by rows of the table."""
+    def indices(self, rows: IndexArray) -> IndexArray:
+        """Indices (M, 3) of the coordinates of landmarks, by rows of the table."""
         return np.asarray(HEAD + 3 * rows[:, None] + np.arange(3))
-
-    def marginals(self, rows: IndexArray) -> tuple[Array, Array, Array]:
-        """Of landmarks, by rows of the table: covariances (M, 3, 3), also (M, 3, 6) with the camera's [r, φ], `by_rig`.
-
-        The last are derivatives (M, 3, m) by errors of the rig.
-        """
-        there, M = rows < self.correlated, len(rows)
-        at, apart = self.numbers(rows[there]), self.apart.select(rows[~there] - self.correlated)
-        own, with_pose, by_rig = np.empty((M, 3, 3)), np.zeros((M, 3, POSE)), np.empty((M, 3, self.by_rig.shape[1]))
-        own[there], own[~there] = self.P[at[:, :, None], at[:, None, :]], apart.own
-        by_rig[there], by_rig[~there] = self.by_rig[at], apart.by_rig
-        with_pose[there] = self.P[at, :POSE]
-        return own, with_pose, by_rig
 
     def joint_poses(self, J: Array, n: int) -> Array:
         """Joint covariance (6n, 6n) of the last poses, the present one, J (6, 6) times [r, φ], last."""
@@ -121,66 +88,67 @@ class Covariance:
         return changed(self, P=P, by_rig=by_rig)
 
     def advanced(self, J: Array, noise: Array, by_error: Array) -> Covariance:
-        """The same; `by_error` (6, 6) times [r, φ], the pose before, is the first of the last ones; the oldest goes."""
+        """The same, and the pose before, `by_error` (6, 6) times [r, φ], becomes the newest clone; the oldest goes."""
         F = np.eye(HEAD, k=-POSE)
-        F[:CAMERA, :CAMERA], F[LEAVING], F[LEAVING, LEAVING] = J, 0.0, np.eye(POSE)
+        F[:CAMERA, :CAMERA], F[REFERENCE], F[REFERENCE, REFERENCE] = J, 0.0, np.eye(POSE)
         F[CAMERA : CAMERA + POSE, :CAMERA] = np.pad(by_error, ((0, 0), (0, POSE)))
         return self.camera_moved(F, noise)
 
-    def leaving_here(self, W: Array) -> Covariance:
-        """The pose that landmarks leave is the present one now; its error W (6, 6) times [r, φ] displaces the world."""
+    def with_reference(self, W: Array) -> Covariance:
+        """With the present pose as the reference pose; W (6, 6) is its `gauge_by_error`."""
         F = np.eye(HEAD)
-        F[LEAVING, LEAVING], F[LEAVING, :POSE] = 0.0, W
-        return changed(self.camera_moved(F), apart=changed(self.apart, way=self.apart.way + self.way(W)))
+        F[REFERENCE, REFERENCE], F[REFERENCE, :POSE] = 0.0, W
+        return self.camera_moved(F)
 
-    def way(self, W: Array) -> Array:
-        """Of the change (6,) of the displacement of the world from the pose that landmarks left until now, W [r, φ]."""
-        D = W @ self.P[:POSE, LEAVING]
-        D = W @ self.pose @ W.T - D - D.T + self.P[LEAVING, LEAVING]
+    def drift(self, W: Array) -> Array:
+        """Covariance (6, 6) of the drift from the reference pose to the present one, a displacement of the world."""
+        D = W @ self.P[:POSE, REFERENCE]
+        D = W @ self.pose @ W.T - D - D.T + self.P[REFERENCE, REFERENCE]
         return np.asarray(0.5 * (D + D.T))
 
     def walked(self, rows: IndexArray, walk: Array) -> Covariance:
-        """After landmarks (`rows` (M,) of the table, none of those that are apart) walk by (M, 3, 3)."""
-        P, at = self.P.copy(), self.numbers(rows)
+        """After landmarks (`rows` (M,) of the table) walk by (M, 3, 3)."""
+        P, at = self.P.copy(), self.indices(rows)
         P[at[:, :, None], at[:, None, :]] += walk
         return changed(self, P=P)
 
     # --- landmarks join and leave ---
 
-    def appended(self, J: Array, noise: Array, by_rig: Array) -> Covariance:
-        """With landmarks ``Y = g(r, φ) + noise`` (paper A, Eq. 10), by derivatives (M, 3, 6) and a covariance (3M, 3M).
+    def appended(self, J: Array, noise: Array, by_rig: Array, shared: Array | float = 0.0) -> Covariance:
+        """With landmarks ``Y = g(r, φ) + noise`` (paper A, Eq. 10), by derivatives (M, 3, 6), the last ones.
 
-        They are the last ones. Errors of the rig move them by `by_rig` (M, 3, m).
+        The noise has covariances (M, 3, 3), beside one (3M, 3M) that they share. Errors of the rig move them by
+        `by_rig` (M, 3, m).
         """
-        n, by_pose = len(self.P), J.reshape(-1, POSE)
+        n, by_pose, each = len(self.P), J.reshape(-1, POSE), np.arange(len(J))
         P, cross = np.empty((n + len(by_pose),) * 2), by_pose @ self.P[:POSE]
         P[:n, :n], P[n:, :n], P[:n, n:] = self.P, cross, cross.T
-        own = cross[:, :POSE] @ by_pose.T + noise
+        own = cross[:, :POSE] @ by_pose.T + shared
+        own.reshape(len(J), 3, len(J), 3)[each, :, each] += noise
         P[n:, n:] = positive(0.5 * (own + own.T), own.diagonal(), POSE)
         return changed(self, P=P, by_rig=np.concatenate([self.by_rig, by_rig.reshape(len(by_pose), -1)]))
 
-    def only(self, rows: IndexArray, apart: IndexArray) -> Covariance:
-        """With these landmarks alone, in each of its two parts; by their rows of the table of landmarks."""
-        kept = self.apart.select(apart - self.correlated)
-        if len(rows) == self.correlated:
-            return changed(self, apart=kept)
-        numbers = np.append(np.arange(HEAD), self.numbers(rows))
-        return Covariance(reordered(self.P, numbers), self.by_rig[numbers], kept)
+    def only(self, rows: IndexArray) -> Covariance:
+        """With these landmarks alone, by their rows of the table."""
+        if len(rows) == self.active:
+            return self
+        indices = np.append(np.arange(HEAD), self.indices(rows))
+        return Covariance(reordered(self.P, indices), self.by_rig[indices])
 
     # --- an update ---
 
     def corrected(self, V: Array, by_rig: Array, J: Array, shift: Array) -> Covariance:
         """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ`` (paper A, Eq. 11).
 
-        The past poses keep the covariance that they have among themselves.
+        The clones keep the covariance that they have among themselves.
 
         Args:
             V: ``K S Kᵀ = V Vᵀ`` (n, ·).
-            by_rig: what errors of the rig change in the update (n, m), as derivatives.
+            by_rig: by which derivatives by errors of the rig fall (n, m).
             J: the corrected camera's error is J (12, 12) times that of the camera before.
             shift: the error of a corrected landmark is what it was plus its shift (N, 3, 6) times that of the pose.
         """
-        last, by_rig, D = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), CAMERA))
+        clones, by_rig, D = slice(CAMERA, HEAD), self.by_rig - by_rig, np.zeros((len(self.P), CAMERA))
         P = dsyrk(-1.0, V, 1.0, self.P.T).T  # the lower triangle: BLAS counts by columns
         mirror(P, CAMERA)
         D[:CAMERA], D[HEAD:] = J - np.eye(CAMERA), shift.reshape(-1, POSE) @ J[:POSE]
@@ -188,23 +156,11 @@ class Covariance:
         half = 0.5 * D @ P[:CAMERA, :CAMERA]
         P = dsyr2k(1.0, D, P[:, :CAMERA] + half, 1.0, P.T, overwrite_c=1).T
         by_rig += D @ by_rig[:CAMERA]
-        P[last, last], by_rig[last] = self.P[last, last], self.by_rig[last]
+        P[clones, clones], by_rig[clones] = self.P[clones, clones], self.by_rig[clones]
         summands = self.P.diagonal() + 2 * (half * D).sum(axis=1)
-        summands[last] = 0.0
+        summands[clones] = 0.0
         mirror(P, len(P))
         return changed(self, P=positive(P, summands, V.shape[1]), by_rig=by_rig)
-
-    def displaced(self, rows: IndexArray, change: Array, shift: Array) -> Covariance:
-        """After a change (M, 3) of some landmarks' coordinates that is none of their error, with a shift as above.
-
-        It is that of the last of the rig's errors, which is known to be 1 (`slam.interfaces.ConsideringBackend`).
-        """
-        by_rig, apart, there = self.by_rig.copy(), self.apart.by_rig.copy(), rows < self.correlated
-        by_rig[self.numbers(rows[there]), -1:] -= change[there, :, None]
-        apart[rows[~there] - self.correlated, :, -1:] -= change[~there, :, None]
-        moved = changed(self, by_rig=by_rig, apart=changed(self.apart, by_rig=apart))
-        nothing = np.zeros((len(self.P), 0))
-        return moved.corrected(nothing, 0 * by_rig, np.eye(CAMERA), shift)
 
 
 @kernel

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from backends.ekf.camera import Camera, Motion, from_body_axes, pose_by_error, predicted, prior
-from backends.ekf.covariance import CAMERA, POSE, RECENT, Covariance, positive
+from backends.ekf.camera import Camera, from_body_axes, pose_by_error, prior
+from backends.ekf.covariance import CAMERA, CLONES, POSE, positive
 from backends.ekf.innovation import Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks, Slide
 from backends.ekf.solve import correction
@@ -45,7 +45,7 @@ class LandmarkFilter:
         stereo: whether the right pixel is measured.
 
     Attributes:
-        state: what is believed now. Each call makes a new one beside it, which takes its place at the end of the call.
+        state: the estimate. Each call makes a new one beside it, which takes its place at the end of the call.
     """
 
     name: str
@@ -63,19 +63,20 @@ class LandmarkFilter:
         self._measure = RectifiedMeasurement(rig, models.with_slide())
         self._slide = Slide.of(models, self._measure.stereo.f)
         self.state = FilterState.first(camera, from_body_axes(camera, prior(models)))
-        self._past: list[tuple[float, Array]] = []  # stamps and poses before the state's
+        # stamps and poses before the state's, by the number of the frame; behind those are some of steps not taken
+        self._past: list[tuple[float, Array]] = []
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
     @one_blas_thread
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
-        return self._moved_on(stamp, rests=False)
+        return self._predict(stamp, rests=False)
 
     @one_blas_thread
     def predict_at_rest(self, stamp: float) -> Prediction:
         """See `slam.interfaces.RestingBackend.predict_at_rest`."""
-        return self._moved_on(stamp, rests=True)
+        return self._predict(stamp, rests=True)
 
     @one_blas_thread
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
@@ -83,7 +84,7 @@ class LandmarkFilter:
         s = self._started("update")
         require_not_measured(self.name, s.measured)
         require_guess(self.name, guess)
-        s = changed(s.with_all_of(observations.ids), measured=True)
+        s = changed(s.with_active(observations.ids), measured=True)
         s, report = self._updated(s, observations, guess)
         self.state = s
         return report
@@ -96,7 +97,7 @@ class LandmarkFilter:
         stereo = self._measure.stereo
         farthest = stereo.f * stereo.baseline / _DISPARITY
         new = self._measure.first_sight(observations.ids, stereo.measure(observations), farthest)
-        self.state = s.placed(self._coordinates, observations.ids, *new)
+        self.state = s.augmented(self._coordinates, observations.ids, *new)
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`."""
@@ -109,7 +110,7 @@ class LandmarkFilter:
         T, P, rows = s.pose.copy(), s.pose_covariance(), s.landmarks.order
         if not landmarks:
             return Estimate(s.stamp, T, P, rows[:0], np.zeros((0, 3)), np.zeros((0, 3, 3)))
-        marks, own = s.landmarks.select(rows), s.covariance.marginals(rows)[0]
+        marks, own = s.landmarks.select(rows), s.marginals(rows)[0]
         D = self._coordinates.jacobian(marks.anchors, marks.c)
         C, summands = D @ own @ D.transpose(0, 2, 1), (D * D @ np.einsum("nii->ni", own)[:, :, None])[:, :, 0]
         blocks = positive(0.5 * (C + C.transpose(0, 2, 1)), summands, 9)
@@ -120,16 +121,16 @@ class LandmarkFilter:
         return self.state.landmarks.points[self.state.landmarks.rows_of(ids)]
 
     def trajectory(self) -> Trajectory:
-        """See `slam.interfaces.Backend.trajectory`: what was believed at each stamp, never revised."""
+        """See `slam.interfaces.Backend.trajectory`: what was estimated at each stamp, never revised."""
         return Trajectory(*self._path())
 
     def recent(self, n: int) -> RecentPoses:
-        """The last n poses, at most five, as believed in their time; see `slam.data.RecentPoses`.
+        """The last n poses, at most five, as estimated in their time; see `slam.data.RecentPoses`.
 
         Raises MeasurementError before the first `predict`, or where n is less than one.
         """
         s = self._started("recent")
-        n = min(require_recent(self.name, n), s.frame + 1, RECENT + 1)
+        n = min(require_recent(self.name, n), s.frame + 1, CLONES + 1)
         return RecentPoses(*self._path(n), s.covariance.joint_poses(pose_by_error(s.camera), n))
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
@@ -144,17 +145,19 @@ class LandmarkFilter:
         anchors[:, :, 3] = positions
         deviations = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         anchors[:, 2, 3] -= np.clip(_STAND_OFF * deviations, 1.0, _FARTHEST_ANCHOR)
-        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, -1)
-        new = changed(new, sights=np.full((len(ids), 3), np.nan), known=np.ones(len(ids), bool))
+        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, -1, s.covariance.by_rig.shape[1])
         D = new.gauge[:, :, :3]
-        self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
+        C = D @ covariances @ D.transpose(0, 2, 1)
+        unseen, yes = np.full((len(ids), 3), np.nan), np.ones(len(ids), bool)
+        new = changed(new, sights=unseen, known=yes, covariance=C, relative=C)
+        self.state = changed(s, landmarks=s.landmarks.joined(new))
 
     @one_blas_thread
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.place`."""
         s = self._started("place")
         known = known_landmarks(self.name, s.landmarks, ids, local, covariances, True)
-        self.state = s.placed(self._coordinates, *known)
+        self.state = s.augmented(self._coordinates, *known)
 
     # --- errors of the rig (documented in slam.interfaces.ConsideringBackend) ---
 
@@ -167,14 +170,14 @@ class LandmarkFilter:
         if pose is not None:
             by_rig[:POSE] = np.linalg.solve(pose_by_error(s.camera), pose)
         self._measure = changed(self._measure, field=field)
-        self.state = changed(s, covariance=Covariance.of_camera(s.covariance.camera, by_rig))
+        self.state = FilterState.first(s.camera, s.covariance.camera, by_rig)
 
     def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
         """See `slam.interfaces.ConsideringBackend.sensitivities`."""
         s = self._started("sensitivities")
         rows = s.landmarks.rows_of(ids)
         D = self._coordinates.jacobian(s.landmarks.anchors[rows], s.landmarks.c[rows])
-        return pose_by_error(s.camera) @ s.covariance.by_rig[:POSE], D @ s.covariance.marginals(rows)[2]
+        return pose_by_error(s.camera) @ s.covariance.by_rig[:POSE], D @ s.marginals(rows)[2]
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
@@ -191,7 +194,7 @@ class LandmarkFilter:
         s, stereo = changed(self.state, measured=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
             rows = np.arange(len(s.landmarks))
-            marks = s.landmarks.select(~s.landmarks.known | (rows < s.covariance.correlated))
+            marks = s.landmarks.select(~s.landmarks.known | (rows < s.covariance.active))
             z, _ = stereo.project(se3.transform(se3.inverse(s.pose), marks.points))
             T = np.where(self.rig.left.in_image(z[:, :2])[:, None, None], s.pose[:3], marks.anchors)
             z, _ = stereo.project(((marks.points - T[:, :, 3])[:, None] @ T[:, :, :3])[:, 0])
@@ -199,7 +202,7 @@ class LandmarkFilter:
             local = stereo.triangulate(stereo.corrected(self.name, z[rows], correct))
             points = (T[rows, :, :3] @ local[:, :, None])[:, :, 0] + T[rows, :, 3]
             good = np.isfinite(points).all(axis=1)
-            s = s.displaced(self._coordinates, marks.ids[rows[good]], points[good])
+            s = s.revised(self._coordinates, marks.ids[rows[good]], points[good])
         self.state = s
 
     # --- the filter's parts ---
@@ -211,19 +214,16 @@ class LandmarkFilter:
         path = [*before, (s.stamp, s.pose)] if s.frame >= 0 else []
         return np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4)
 
-    def _moved_on(self, stamp: float, rests: bool) -> Prediction:
-        """Go to a time, and say what is in the angle of view then; whether the camera rests meanwhile."""
-        s = self.state if self._kept is None else self.state.with_most(self._kept)
+    def _predict(self, stamp: float, rests: bool) -> Prediction:
+        """Predict the state and what is in the angle of view; whether the camera rests meanwhile."""
+        s = self.state if self._kept is None else self.state.with_most_active(self._kept)
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
-        motion: Motion = s.camera, np.eye(CAMERA), np.zeros((CAMERA, CAMERA))
-        if s.frame >= 0:
-            motion = predicted(s.camera, self.models, s.covariance.camera, stamp - s.stamp, rests)
-        T = motion[0].pose
+        after = s.advanced(float(stamp), self.models, rests)
+        T = after.pose
         rows = self._measure.visible(T, s.landmarks.points)
-        after = s.advanced(float(stamp), motion)
         marks, walk = after.landmarks.select(rows), self._slide.walked(after.landmarks, rows, T[:3, 3])[1]
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
-        local = toward @ (after.from_camera(rows) + walk) @ toward.transpose(0, 2, 1)
+        local = toward @ (after.relative_covariances(rows) + walk) @ toward.transpose(0, 2, 1)
         left, right, S = self._measure.pixels((marks.points - T[:3, 3]) @ T[:3, :3], local)
         prediction = Prediction(after.stamp, T.copy(), after.pose_covariance(), marks.ids, left, right, S)
         self._past[after.frame - 1 :] = [(s.stamp, s.pose)] if after.frame else []
@@ -242,7 +242,7 @@ class LandmarkFilter:
         slid = s.slid(self._slide, rows, (s.pose if guess is None else guess)[:3, 3])
         update = Update(
             s.camera, slid.covariance, slid.landmarks.select(rows), rows, z, self._measure, self._coordinates,
-            self._iterations,
+            self._iterations, self._measure.limits(z),
         )  # fmt: skip
         update = update if guess is None else update.regular_towards(guess)
 

@@ -40,7 +40,7 @@ LIMIT = np.pi / 4
 
 @dataclass(frozen=True, eq=False)
 class EulerCamera:
-    """The papers' [r, φ, v, ω]: position, Euler angles, and their rates; the error is that of these numbers."""
+    """The papers' [r, φ, v, ω]: position, Euler angles, and their rates; the error is that of these 12."""
 
     x: Array  # (12,) [m], [rad], [m/s], [rad/s]
     R_world_angles: Array  # the angles' world (3, 3), see the module
@@ -63,11 +63,11 @@ class EulerCamera:
         return self.x[6:9]
 
     @cached_property
-    def turning(self) -> Array:
+    def attitude_jacobian(self) -> Array:
         """See `Camera`."""
         return np.asarray(self.pose[:3, :3] @ body_rate_matrix(self.x[3:6]))
 
-    def moved(self, error: Array) -> EulerCamera:
+    def plus(self, error: Array) -> EulerCamera:
         """See `Camera`."""
         return replace(self, x=self.x + error)
 
@@ -95,7 +95,7 @@ class EulerCamera:
         for piece in range(pieces):
             phi_y, rate = camera.x[[4, 10]]
             if max(abs(phi_y), abs(phi_y + rate * dt / pieces)) > LIMIT:
-                camera, G = camera.reanchored(camera.pose)
+                camera, G = camera.with_new_angles(camera.pose)
                 J = G @ J
                 W = G @ W if piece else W
             camera, A = camera._transition(dt / pieces)
@@ -106,7 +106,7 @@ class EulerCamera:
         """``x ← f(x)`` as printed, and A: as printed if the covariance is not transported.
 
         If the covariance is transported, the attitude's error is carried as a turn about the world's axes, not as one
-        of the angles φ, and the rates' error is that of the body's rate, in numbers of the angles' rates: a turn of the
+        of the angles φ, and the rates' error is that of the body's rate, as rates of the angles: a turn of the
         world leaves it as it is. The printed transition has constant rates of the angles, which is not the same in
         another world. As printed, A is the derivative of f, but the covariance would shrink along turns of the world,
         which nothing measures, in every step.
@@ -115,7 +115,7 @@ class EulerCamera:
         A[:POSE, POSE:] = dt * np.eye(POSE)
         after = replace(self, x=A @ self.x)
         if self.transports:
-            A[3:6, 3:6] = np.linalg.solve(after.turning, self.turning)
+            A[3:6, 3:6] = np.linalg.solve(after.attitude_jacobian, self.attitude_jacobian)
         return after, A
 
     def stopped(self) -> EulerCamera:
@@ -125,10 +125,10 @@ class EulerCamera:
     def regular_towards(self, T: Array) -> tuple[EulerCamera, Array]:
         """See `Camera`."""
         sine = self.R_world_angles[:, 2] @ T[:3, 0]  # −sin φy
-        return self.reanchored(T) if abs(sine) > math.sin(LIMIT) else (self, np.eye(CAMERA))
+        return self.with_new_angles(T) if abs(sine) > math.sin(LIMIT) else (self, np.eye(CAMERA))
 
-    def reanchored(self, T: Array) -> tuple[EulerCamera, Array]:
-        """In a new angles' world, chosen for its attitude; and the Jacobian (12, 12) of its numbers by the old.
+    def with_new_angles(self, T: Array) -> tuple[EulerCamera, Array]:
+        """In a new angles' world, chosen for its attitude; and the Jacobian (12, 12) of its error by the old.
 
         Its y is the camera's right, its z across the right of both this and a pose T (4, 4): φy is zero there, too; or,
         where both look alike, the camera's down.

@@ -2,22 +2,19 @@
 
 In the papers' order: the innovation (`backends.ekf.innovation`), the gate, the gain ``K = P Hᵀ S⁻¹``, the corrected
 state ``x + K ν`` and its covariance ``P − K S Kᵀ`` (paper A, Eq. 11). What is kept is ``y = S⁻¹ ν``: the state changes
-by ``P Hᵀ y``. From the outside in:
+by ``P Hᵀ y``. From the inside out:
 
-- `correction` tries the prior, the caller's guess, then (`_restarted`) a pose on which the landmarks agree. If most
-  observations contradict the prediction, it is the prediction that is wrong: by more than its linearisation holds for,
-  or, after an impulse that the motion model does not expect, a gap, or a stretch with hardly anything to see, by more
-  than it can be. Then the camera restarts where the landmarks see it, in the same map.
-- `_agreed` refuses what so few wrong observations as pass the gate may agree on by chance.
-- `gated_correction` updates by what the `gate` lets through, and takes in what the solution predicts after all.
-- `_agreeing` takes out what the other measurements contradict; `_iterate` linearises until that is good enough.
+- `_iterated`: an iterated EKF's update by given landmarks.
+- `_without_outliers`: takes out those that the others contradict.
+- `gated_correction`: of those in the gate; then with those that the solution predicts after all.
+- `_plausible`: none where so few agree as wrong observations may by chance.
+- `correction`: linearised at the prior, at the caller's guess, or (`_restarted`) at a pose on which landmarks agree.
 """
 
 from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -30,7 +27,7 @@ from slam.data import BoolArray
 from slam.geometry import se3
 from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array
-from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, by_chance, squared_distances
+from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, by_chance
 from slam.window.recovery import Search
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise: `iterations`
@@ -41,30 +38,21 @@ _LINEAR = 1.0
 _POSE_SHARE = 0.25
 
 
-@dataclass(frozen=True, eq=False)
-class Gated:
-    """Which landmarks each lie within the gate of their own innovation covariance."""
-
-    used: BoolArray  # (M,)
-    limits: Array  # of the gate (M,)
-    distances: Array  # squared, of the innovations (M,); NaN where none is predicted
-    at: Linearisation  # where they are from
-
-
 def correction(update: Update, guess: Array | None, search: Search) -> Correction | None:
     """Solve with the prior, or where it fails the pose, that most observations agree with; None where there is none.
 
-    It is linearised at the prior, then at the guess, a pose (4, 4), if there is one. Where less than a third of the
-    observations agrees, and as many wrong ones might agree by chance, that agreement is ignored: it could move the pose
-    anywhere. An agreement of a minority counts only if nothing else is found; of two, the larger. `search` is only
-    called where nothing else helps. Raises LinAlgError where the reason is numerical.
+    If most observations contradict the prediction, it is the prediction that is wrong: by more than its linearisation
+    holds for, so the guess, a pose (4, 4), is tried; or, after an impulse that the motion model does not expect, a gap,
+    or a stretch with hardly anything to see, by more than it can be. Then the camera restarts where the landmarks see
+    it, in the same map. An agreement of a minority counts only if nothing else is found; of two, the larger. `search`
+    is only called where nothing else helps. Raises LinAlgError where the reason is numerical.
     """
     if not (np.isfinite(update.camera.pose).all() and math.isfinite(update.covariance.P.trace())):
         raise LinAlgError("the predicted state is not finite")
     minorities, error, majority = [], None, (len(update.z) + 1) // 2
-    for T in (None,) if guess is None else (None, guess):
+    for camera in (update.camera, *(() if guess is None else (update.camera.at(guess),))):
         try:
-            agreed = _agreed(gate(update, T))
+            agreed = _plausible(update.linearised(camera))
         except LinAlgError as reason:  # another start may do
             error = reason
             continue
@@ -87,72 +75,59 @@ def _restarted(update: Update, search: Search, least: int) -> Correction | None:
     noise = from_body_axes(there.camera, prior(update.measure.models, (float(far), float(turned))))
     there = changed(there, covariance=there.covariance.camera_moved(np.eye(CAMERA), noise))
     with suppress(LinAlgError):
-        found = gated_correction(gate(there, T))
+        found = gated_correction(there.linearised(there.camera.at(T)))
         return found if found is not None and found.used.sum() >= least else None
     return None
 
 
-def _agreed(gated: Gated) -> Correction | None:
-    """What agrees with a prediction, if it is more than might agree by chance at the gate's own level."""
-    found = gated_correction(gated)
-    agreed = np.zeros_like(gated.used) if found is None else found.used
+def _plausible(at: Linearisation) -> Correction | None:
+    """What agrees with a prediction; None where it is less than a third, and as many wrong ones might agree by chance.
+
+    Such an agreement could move the pose anywhere.
+    """
+    found, update = gated_correction(at), at.update
+    agreed = np.zeros(len(at.h), bool) if found is None else found.used
     if len(agreed) < MIN_OBSERVATIONS or ONE_AGREES_IN * agreed.sum() >= len(agreed):
         return found
-    update = gated.at.update
-    chance = by_chance(update.z, agreed, gated.distances, update.measure.models.gate_probability)
-    return None if chance else found
+    return None if by_chance(update.z, agreed, at.distances, update.measure.models.gate_probability) else found
 
 
-def gate(update: Update, T: Array | None = None) -> Gated:
-    """Test each landmark by itself, with its innovation linearised at the prior, or with the camera at a pose T (4, 4).
-
-    Raises LinAlgError where S is not positive definite.
-    """
-    at = update.linearised(None if T is None else update.camera.at(T))
-    limits = update.measure.limits(update.z)
-    own = squared_distances(at.nu.reshape(-1, 3), np.einsum("iaib->iab", at.S.reshape(len(at.z), 3, -1, 3)))
-    if not np.isfinite(own).all():
-        raise LinAlgError("the predicted innovations are not finite or not positive definite")
-    distances = np.where(np.isfinite(at.z).all(axis=1), own, np.nan)
-    return Gated(np.asarray(distances <= limits), limits, distances, at)
-
-
-def gated_correction(gated: Gated) -> Correction | None:
-    """Solve with what passed the gate and agrees; then once more with what the solution predicts after all.
+def gated_correction(at: Linearisation) -> Correction | None:
+    """Solve with what passes the gate and agrees; then once more with what the solution predicts after all.
 
     None where nothing is left. Raises LinAlgError where S or the pose's covariance is not positive definite, or the
     new state not finite.
     """
-    found, update = _with_readmitted(gated), gated.at.update
+    found = _with_readmitted(at)
     if found is not None:
-        regular = update.regular_towards(found.camera.pose)
-        if regular is not update:  # the coordinates of its error are nearly singular there
-            found, update = _with_readmitted(gate(regular, found.camera.pose)), regular
+        regular = at.update.regular_towards(found.camera.pose)
+        if regular is not at.update:  # the coordinates of its error are nearly singular there
+            found = _with_readmitted(regular.linearised(regular.camera.at(found.camera.pose)))
     if found is not None and dpotrf(found.pose_covariance, lower=1)[1] != 0:
         raise LinAlgError("the pose's covariance would not stay positive definite")
     return found
 
 
-def _with_readmitted(gated: Gated) -> Correction | None:
-    """With what passed the gate, and again where the solution predicts more."""
-    found = _agreeing(gated, gated.used)
+def _with_readmitted(at: Linearisation) -> Correction | None:
+    """By the landmarks that each lie within the gate, and again where the solution predicts more."""
+    found, limits = _without_outliers(at, at.distances <= at.update.limits), at.update.limits
     if found is not None:
-        there = found.at.seen.any(axis=1) & np.isfinite(gated.distances)
-        more = ~found.used & there & (found.distances <= gated.limits)
-        found = (_agreeing(gated, found.used | more) or found) if more.any() else found
+        there = found.at.valid.any(axis=1) & np.isfinite(at.distances)
+        more = ~found.used & there & (found.conditional_distances <= limits)
+        found = (_without_outliers(at, found.used | more) or found) if more.any() else found
     return found
 
 
-def _agreeing(gated: Gated, used: BoolArray) -> Correction | None:
+def _without_outliers(at: Linearisation, used: BoolArray) -> Correction | None:
     """Solve with some landmarks (mask (M,)), and take out what the other measurements contradict, the worst first.
 
     A wrong match spoils the tests of its neighbours, so a round takes out only landmarks at least half as far off as
     the worst one, until all that is left agrees; None where nothing is left.
     """
     while used.any():
-        found = _iterate(gated.at, used)
+        found = _iterated(at, used)
         used = found.used
-        excess = np.where(used, found.distances / gated.limits, 0.0)
+        excess = np.where(used, found.conditional_distances / at.update.limits, 0.0)
         worst = excess.max()
         if worst <= 1:
             return found if used.any() else None
@@ -160,19 +135,18 @@ def _agreeing(gated: Gated, used: BoolArray) -> Correction | None:
     return None
 
 
-def _iterate(at: Linearisation, used: BoolArray) -> Correction:
+def _iterated(at: Linearisation, used: BoolArray) -> Correction:
     """An update by some landmarks (mask (M,)), first linearised as it is there, then at each solution (Gauss-Newton).
 
-    One iteration is taken as it is: the papers' filter.
-    What comes to lie behind the camera counts no more. Without the transport of the covariance this ends at the maximum
-    of the posterior. With it H leaves out what would measure the gauge, and the end is off that by what is of second
-    order in a step.
+    One iteration is taken as it is: the papers' filter. What comes to lie behind the camera counts no more. Without the
+    transport of the covariance this ends at the maximum of the posterior. With it H leaves out what would measure the
+    gauge, and the end is off that by what is of second order in a step.
     """
     update, found = at.update, None
     for _ in range(update.iterations):
         if found is not None:
             at = update.linearised(found.camera, found.change[HEAD:])
-        used = used & at.seen.any(axis=1)
+        used = used & at.valid.any(axis=1)
         found = at.solved(used)
         if not np.isfinite(found.change).all() or np.abs((found.change - at.change)[3:6]).max() > np.pi:
             raise LinAlgError("a step is not finite, or turns the camera by more than half a turn")
@@ -185,11 +159,11 @@ def _iterate(at: Linearisation, used: BoolArray) -> Correction:
 def _linear(found: Correction) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
     now, update = found.at, found.at.update
-    step = (found.change - now.change)[update.numbers]
-    as_seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
-    errors = update.pixels_from(found.camera, found.change) - now.z - (now.own @ as_seen[:, :, None])[:, :, 0]
-    errors = np.where(now.seen & found.used[:, None], errors, 0.0)
+    step = (found.change - now.change)[update.indices]
+    relative = step[POSE:].reshape(-1, 3) - now.N @ step[:POSE]
+    errors = update.pixels_from(found.camera, found.change) - now.h - (now.H_landmark @ relative[:, :, None])[:, :, 0]
+    errors = np.where(now.valid & found.used[:, None], errors, 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
-    shift = found.white(errors.reshape(-1)) @ found.white_pose
+    shift = found.whitened(errors.reshape(-1)) @ found.whitened_pose
     return bool((shift**2 <= _POSE_SHARE**2 * found.pose_covariance.diagonal()).all())

@@ -42,9 +42,9 @@ class InvariantCamera:
     v: Array  # velocity (3,) in the world [m/s]
     rate: Array  # the body's rate ω (3,) [rad/s]
     transports = True
-    turning = np.eye(3)
+    attitude_jacobian = np.eye(3)
 
-    def moved(self, error: Array) -> InvariantCamera:
+    def plus(self, error: Array) -> InvariantCamera:
         """See `Camera`."""
         T = se3.pose(se3.so3_exp(error[3:6]) @ self.pose[:3, :3], self.pose[:3, 3] + error[:3])
         return replace(self, pose=T, v=self.v + error[6:9], rate=self.rate + error[9:])

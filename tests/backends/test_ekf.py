@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from backends.ekf import EkfBackend
-from backends.ekf.camera import displacement
+from backends.ekf.camera import gauge_by_error
 from backends.ekf.camera import predicted as motion
 from backends.iekf import IekfBackend
 from backends.iekf.filter import InvariantCamera
@@ -100,9 +100,9 @@ def test_what_nothing_measures_stays_unknown(drive, make, options):
         for stamp, _, seen in list(data)[:25]:
             step(backend, stamp, seen, known)
         camera, marks = backend.state.camera, backend.state.landmarks
-        shift = np.zeros((12 + 3 * backend.state.covariance.correlated, 6))
-        shift[:6], shift[6:9, 3:] = np.linalg.inv(displacement(camera)), -se3.hat(camera.v)
-        shift[12:] = marks.gauge[: backend.state.covariance.correlated].reshape(-1, 6)
+        shift = np.zeros((12 + 3 * backend.state.covariance.active, 6))
+        shift[:6], shift[6:9, 3:] = np.linalg.inv(gauge_by_error(camera)), -se3.hat(camera.v)
+        shift[12:] = marks.gauge[: backend.state.covariance.active].reshape(-1, 6)
         information = sigma**2 * shift.T @ np.linalg.solve(dense(backend.state.covariance), shift)
         learnt.append(np.diag(information))
     assert (learnt[0] < (1.01 if ekf else 1.001)).all()  # less than 1 where the model's impulses have loosened it
@@ -236,7 +236,7 @@ def test_the_motion_and_its_derivatives():
     np.testing.assert_allclose(camera.pose[:3, 3], T[:3, 3] + dt * start.v, atol=1e-12)
 
     def moved(xi):
-        return start.moved(xi).advanced(dt)[0].minus(camera)
+        return start.plus(xi).advanced(dt)[0].minus(camera)
 
     np.testing.assert_allclose(J, jacobian(moved, np.zeros(12)), atol=1e-8)
 

@@ -172,7 +172,7 @@ def test_a_landmark_in_contradiction_with_the_others_is_found(drive):
 def test_a_broken_covariance_is_a_status_with_a_reason(drive, entry, where):
     backend, seen = predicted(drive, 5)
     P = backend.state.covariance
-    broken, row = P.P.copy(), 1 if where == "pose" else P.numbers(backend.state.landmarks.rows_of(seen.ids[3:4]))[0, 0]
+    broken, row = P.P.copy(), 1 if where == "pose" else P.indices(backend.state.landmarks.rows_of(seen.ids[3:4]))[0, 0]
     broken[row, row] = entry
     backend.state = replace(backend.state, covariance=replace(P, P=broken))
     before = backend.state
@@ -220,8 +220,7 @@ def test_a_roll_in_one_step(make, degrees):
 def test_of_two_agreements_of_minorities_the_larger_counts(monkeypatch):
     agreeing = iter([4, 1])
     found = lambda _: SimpleNamespace(used=np.arange(12) < next(agreeing))  # noqa: E731
-    monkeypatch.setattr("backends.ekf.solve.gate", lambda update, T: T)
-    monkeypatch.setattr("backends.ekf.solve._agreed", found)
-    camera, covariance = SimpleNamespace(pose=np.eye(4)), SimpleNamespace(P=np.eye(3))
-    update = SimpleNamespace(camera=camera, covariance=covariance, z=np.zeros((12, 3)))
+    monkeypatch.setattr("backends.ekf.solve._plausible", found)
+    camera, covariance = SimpleNamespace(pose=np.eye(4), at=lambda T: T), SimpleNamespace(P=np.eye(3))
+    update = SimpleNamespace(camera=camera, covariance=covariance, z=np.zeros((12, 3)), linearised=lambda camera: None)
     assert correction(update, np.eye(4), lambda: None).used.sum() == 4

@@ -128,7 +128,7 @@ def test_a_prior_maps_features_slide_up_to_the_first_sight_and_on(share):
     backend, point = backends.create("iekf", RIG, models=known), np.array([[0.0, 0.0, 5.0]])
     backend.insert(np.array([7]), point, 1e-6 * np.eye(3)[None])
     backend.predict(0.0)
-    backend.state = backend.state.with_all_of(np.array([7]))
+    backend.state = backend.state.with_active(np.array([7]))
 
     def walked(x: float) -> float:  # variance across the line of sight [px²], over what was known
         backend.state = backend.state.slid(Slide.of(known, 400.0), np.array([0]), np.array([x, 0.0, 0.0]))

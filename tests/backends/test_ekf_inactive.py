@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import backends
-from backends.ekf.camera import displacement
+from backends.ekf.camera import gauge_by_error
 from slam.data import Observations
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
@@ -42,9 +42,9 @@ def swayed(name: str, frames: int, seed: int = 0, considers: bool = False, **opt
     return backend, poses, points, sights
 
 
-def left(state) -> np.ndarray:
-    """Ids of the landmarks that have left the state."""
-    return state.landmarks.ids[state.covariance.correlated :]
+def inactive(state) -> np.ndarray:
+    """Ids of the inactive landmarks."""
+    return state.landmarks.ids[state.covariance.active :]
 
 
 @BOTH
@@ -53,10 +53,10 @@ def test_a_landmark_that_leaves_stays_where_it_is_and_as_uncertain(name):
     backend, *_ = swayed(name, 30, considers=True, kept=None)
     whole, s = backend.estimate(), backend.state
     ids, J = whole.ids, backend.sensitivities(whole.ids)
-    seen = s.from_camera(s.landmarks.rows_of(ids))
-    backend.state = s = s.with_most(KEPT)
-    assert len(left(s)) > 50 and s.covariance.correlated <= KEPT
-    assert s.landmarks.last[s.covariance.correlated :].max() <= s.landmarks.last[: s.covariance.correlated].min()
+    seen = s.relative_covariances(s.landmarks.rows_of(ids))
+    backend.state = s = s.with_most_active(KEPT)
+    assert len(inactive(s)) > 50 and s.covariance.active <= KEPT
+    assert s.landmarks.last[s.covariance.active :].max() <= s.landmarks.last[: s.covariance.active].min()
     after, rows = backend.estimate(), s.landmarks.rows_of(ids)
     np.testing.assert_array_equal(after.ids, ids)
     np.testing.assert_array_equal(after.positions, whole.positions)
@@ -64,7 +64,7 @@ def test_a_landmark_that_leaves_stays_where_it_is_and_as_uncertain(name):
     np.testing.assert_allclose(after.covariances, whole.covariances, rtol=1e-9, atol=1e-15)
     for found, expected in zip(backend.sensitivities(ids), J):
         np.testing.assert_array_equal(found, expected)
-    np.testing.assert_allclose(s.from_camera(rows), seen, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(s.relative_covariances(rows), seen, rtol=1e-9, atol=1e-12)
 
 
 @BOTH
@@ -72,33 +72,33 @@ def test_one_that_is_measured_again_is_new_to_the_camera(name):
     """As uncertain as the camera's way since has made it, and independent of the pose as seen from the camera."""
     backend, *_ = swayed(name, 60, considers=True, kept=KEPT)
     s, P = backend.state, backend.estimate(landmarks=False).covariance
-    ids = left(s)
+    ids = inactive(s)
     rows = s.landmarks.rows_of(ids)
-    seen, apart = s.from_camera(rows), s.covariance.apart
-    assert (np.trace(seen - apart.seen, axis1=1, axis2=2) > 0).all()  # with the camera's way
+    seen, gone = s.relative_covariances(rows), s.landmarks.select(rows)
+    assert (np.trace(seen - gone.relative, axis1=1, axis2=2) > 0).all()  # with the camera's way
     J = backend.sensitivities(ids)[1]
-    backend.state = s = s.with_all_of(ids)
-    assert not len(left(s))
+    backend.state = s = s.with_active(ids)
+    assert not len(inactive(s))
     rows = s.landmarks.rows_of(ids)
-    np.testing.assert_allclose(s.from_camera(rows), seen, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(s.relative_covariances(rows), seen, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(backend.sensitivities(ids)[1], J)
     np.testing.assert_array_equal(backend.estimate(landmarks=False).covariance, P)
     # a measurement of them, however exact, says nothing of the camera
-    at = s.covariance.numbers(rows).ravel()
+    at = s.covariance.indices(rows).ravel()
     G, H = s.landmarks.gauge[rows], np.eye(len(s.covariance.P))[at]
-    H[:, :6] = -(G @ displacement(s.camera)).reshape(-1, 6)
+    H[:, :6] = -(G @ gauge_by_error(s.camera)).reshape(-1, 6)
     np.testing.assert_allclose(H @ s.covariance.P[:, :6], 0, atol=1e-12)
     # nor do many together know where the pose is that the last of them left, better than by the way from there
     half = len(ids) // 2
     U, E = G[:half].reshape(-1, 6), H[: 3 * half]
     known = np.linalg.inv(U.T @ np.linalg.solve(E @ s.covariance.P @ E.T, U))
-    way = s.covariance.way(displacement(s.camera)) + apart.way[half - 1]
+    way = s.covariance.drift(gauge_by_error(s.camera)) + s.drifts[gone.reference[half - 1]]
     assert half > 50 and np.linalg.eigvals(np.linalg.solve(way, known)).real.min() > 1.0
 
 
 def uncertain(backend, ids) -> np.ndarray:
     """Of landmarks: the deviations [rad] of their directions as seen from the camera."""
-    found = backend.state.from_camera(backend.state.landmarks.rows_of(ids))
+    found = backend.state.relative_covariances(backend.state.landmarks.rows_of(ids))
     return np.sqrt(np.trace(found[:, :2, :2], axis1=1, axis2=2))
 
 
@@ -109,8 +109,8 @@ def test_in_the_dark_one_that_has_left_is_as_uncertain_as_one_that_stayed(name, 
     found, again = [], []
     for leave in (True, False):
         backend, _, _, sights = swayed(name, 40, kept=None)
-        ids = left(backend.state.with_most(KEPT))
-        backend.state = backend.state.with_most(KEPT) if leave else backend.state
+        ids = inactive(backend.state.with_most_active(KEPT))
+        backend.state = backend.state.with_most_active(KEPT) if leave else backend.state
         for k in range(dark):
             backend.predict(DT * (40 + k))
         found.append(uncertain(backend, ids))
@@ -132,12 +132,12 @@ def test_a_camera_that_hovers_knows_where_those_that_have_left_are(name, frames)
     for kept in (KEPT, None):
         backend, poses, points, _ = swayed(name, frames, kept=kept)
         known, rng = set(backend.state.landmarks.ids.tolist()), np.random.default_rng(5)
-        ids = np.intersect1d(ids, left(backend.state)) if kept else ids
+        ids = np.intersect1d(ids, inactive(backend.state)) if kept else ids
         for k in range(30):
             T = poses[frames - 1].copy()
             T[0, 3] += 0.01 * np.sin(0.3 * k)
             step(backend, DT * (frames + k), observe(T, points, MODELS.pixel_sigma, rng, 40), known)
-        ids = np.intersect1d(ids, left(backend.state)) if kept else ids
+        ids = np.intersect1d(ids, inactive(backend.state)) if kept else ids
         found.append(uncertain(backend, ids))
     ratio = found[0] / found[1]
     assert len(ids) > 30 and ratio.min() > 0.9 and np.median(ratio) < 1.5
@@ -151,7 +151,7 @@ def test_a_camera_that_turns_away_and_back_knows_how_far_it_is_off(name):
         backend, poses, _, sights = swayed(name, 0, seed, kept=KEPT)
         known: set[int] = set()
         for k, T in enumerate(poses):
-            gone = set(left(backend.state).tolist())
+            gone = set(inactive(backend.state).tolist())
             report = step(backend, DT * k, sights[k], known)
             again += len(gone & set(report.used.tolist()))
             now = backend.estimate(landmarks=False)
@@ -173,13 +173,13 @@ def test_landmarks_that_have_left_are_revised_too(name):
     found = []
     for kept in (KEPT, None):
         backend, *_ = swayed(name, 30, considers=True, kept=None)
-        s = backend.state = backend.state if kept is None else backend.state.with_most(kept)
+        s = backend.state = backend.state if kept is None else backend.state.with_most_active(kept)
         ids = np.sort(s.landmarks.ids)
         before, J = backend.positions(ids), backend.sensitivities(ids)[1]
         backend.revise(lambda z: z + np.array([1e-3, 0.0, -1e-3]))  # [px], so little that it is linear
         moved = backend.positions(ids) - before
         found.append((moved, (backend.sensitivities(ids)[1] - J)[:, :, -1]))
-        assert kept is None or np.linalg.norm(moved[np.isin(ids, left(s))], axis=1).min() > 1e-5
+        assert kept is None or np.linalg.norm(moved[np.isin(ids, inactive(s))], axis=1).min() > 1e-5
     np.testing.assert_allclose(found[0][0], found[1][0], atol=1e-12)
     size = np.abs(found[0][0]).max()
     for moved, change in found:
@@ -202,9 +202,9 @@ def test_they_are_removed_and_those_of_a_prior_map_stay_in_the_state(name):
         known |= set(sights[k].ids.tolist())
     backend.predict(1.0)
     s = backend.state
-    inserted, state = s.landmarks.known, s.landmarks.last[: s.covariance.correlated]
+    inserted, state = s.landmarks.known, s.landmarks.last[: s.covariance.active]
     assert (s.landmarks.last[inserted] >= 0).sum() > 20
     assert set(s.landmarks.ids[: len(state)]) >= set(s.landmarks.ids[inserted & (s.landmarks.last >= 0)])
-    assert set(left(s).tolist()) >= known - set(sights[3].ids.tolist())
-    backend.remove(left(s)[::2])
-    assert len(left(backend.state)) == len(left(s)) // 2
+    assert set(inactive(s).tolist()) >= known - set(sights[3].ids.tolist())
+    backend.remove(inactive(s)[::2])
+    assert len(inactive(backend.state)) == len(inactive(s)) // 2
