@@ -23,8 +23,8 @@ from slam.geometry.arrays import Table, changed, median
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig, measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.tracks.follow import Windows, follow
-from slam.window.recovery import LASTING
 
+_FRAMES = 3  # in which a feature stays at its pixel, and in which most do, before that counts
 _GATE = chi_square_limit(3, 0.997)  # of the displacement of a feature that stays
 _MOVES = chi_square_limit(6, 1 - 1e-4)  # of a common motion; asked in every frame
 _MEDIAN = chi_square_limit(3, 0.5)
@@ -55,7 +55,7 @@ class Places(Table):
         # 10: sights whose mean is a feature's place; later ones would follow a slow motion
         share = np.where(sights[at] <= 10, 1.0 / sights[at], 0.0)
         mean[at] += share[:, None] * (z[rows] - mean[at])
-        keep = np.flatnonzero((missed <= sights) | (sights > LASTING))
+        keep = np.flatnonzero((missed <= sights) | (sights > _FRAMES))
         keep = np.sort(keep[np.argsort(missed[keep], kind="stable")][:3000])  # 3000: features
         new = np.delete(np.arange(len(z)), rows)
         kept = changed(self, z=mean, sights=sights, missed=missed).select(keep)
@@ -78,7 +78,7 @@ class Standing:
     @cached_property
     def stands(self) -> bool:
         """Whether the camera stands for certain."""
-        return self.frames > LASTING
+        return self.frames > _FRAMES
 
     def holds(self, lost: bool) -> bool:
         """Whether the camera stands at a known place, or something hides what it knows: then no other is looked for."""
@@ -103,7 +103,7 @@ class Standing:
         most = 2 * len(rows) > min(len(z), int((places.missed == 0).sum()))
         if not (self.stands or most):
             return begun
-        witnesses = stereo[rows[places.sights[at] >= LASTING]]
+        witnesses = stereo[rows[places.sights[at] >= _FRAMES]]
         places_after = places.after(at, rows, z, seen)
         at_rest, variance = _at_rest(rig, places.z[at], shift, self.variance)
         if at_rest:

@@ -22,7 +22,7 @@ from slam.geometry.se3 import Array, inverse, log
 from slam.window import pose_only
 from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, by_chance
 
-LASTING = 3  #: frames in succession that say the same before it counts: one or two may be at fault themselves
+_LASTING = 3  # updates in succession that contradict the path: one or two may be at fault themselves
 _ANY_TURN = np.pi**2 / 3  # variance of a turn by any angle [rad²]
 
 
@@ -55,7 +55,7 @@ def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, cont
     there = search() if len(used) >= MIN_CONSENSUS else None
     found = None if there is None else _seated(problem, there)
     contradicted = 0 if found is None else contradicted + 1
-    if found is not None and (found.jump is None or contradicted >= LASTING):
+    if found is not None and (found.jump is None or contradicted >= _LASTING):
         return found
     few = len(used) >= MIN_OBSERVATIONS and ONE_AGREES_IN * used.sum() < len(used)
     if few and by_chance(problem.z, used, problem.distances(T), problem.probability, MINIMAL_POINTS):
