@@ -18,6 +18,7 @@ from slam.models import EstimatorModels
 from slam.window.motion import STANDS, is_first, velocity_sigmas
 from slam.window.stereo import RectifiedStereo
 
+SmartFactor = gtsam_unstable.SmartStereoProjectionPoseFactor
 _FAR = 5 * 2**0.5  # probability: sigmas of a pixel; noise changes a disparity by more once in a million times
 _LOOSE = np.diag(np.repeat([9.0, 1e4], 3))  # numerics: variances [rad²], [m²] of a motion that is unknown
 
@@ -77,12 +78,12 @@ class FactorMaker:
         """A measurement (uL, vL, uR); uR may be NaN."""
         return gtsam.StereoPoint2(z[0], z[2], z[1])
 
-    def smart(self, points: Sequence[gtsam.StereoPoint2], keys: Sequence[int]) -> gtsam.NonlinearFactor:
+    def smart(self, points: Sequence[gtsam.StereoPoint2], keys: Sequence[int]) -> SmartFactor:
         """A landmark eliminated from its measurements, of which two or more are needed and one with a right pixel.
 
         It tells nothing, and is not valid, where the measurements put it behind a camera.
         """
-        factor = gtsam_unstable.SmartStereoProjectionPoseFactor(self._noise, self._smart)
+        factor = SmartFactor(self._noise, self._smart)
         factor.add(points, keys, self._K)
         return factor
 

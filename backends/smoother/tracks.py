@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import gtsam
 from gtsam.symbol_shorthand import L, X
 
-from backends.smoother.factors import FactorMaker, GraphUpdate
+from backends.smoother.factors import FactorMaker, GraphUpdate, SmartFactor
 from backends.smoother.state import SmootherState
 from slam.geometry.se3 import Array, transform
 
@@ -23,7 +23,7 @@ class Track:
     # whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only
     stereo: bool = False
     far: bool = False  # whether noise alone may put it behind the camera, by one of them
-    factor: gtsam.NonlinearFactor | None = None  # None while there are too few measurements
+    factor: SmartFactor | None = None  # None while there are too few measurements
     slot: int = -1  # of the factor in the solver
 
 
