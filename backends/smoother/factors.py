@@ -18,6 +18,7 @@ from slam.models import EstimatorModels
 from slam.window.motion import STANDS, is_first, velocity_sigmas
 from slam.window.stereo import RectifiedStereo
 
+SmartFactor = gtsam_unstable.SmartStereoProjectionPoseFactor
 _FAR = 5 * 2**0.5  # probability: sigmas of a pixel; noise changes a disparity by more once in a million times
 _LOOSE = np.diag(np.repeat([9.0, 1e4], 3))  # numerics: variances [rad²], [m²] of a motion that is unknown
 
@@ -31,19 +32,17 @@ class FactorMaker:
     """Makes factors for one rig and one set of models: of poses X(number) and landmarks L(serial number).
 
     Attributes:
-        sigma: noise of a pixel [px].
         far: disparity [px] below which a measurement tells hardly that its landmark is in front of the camera.
     """
 
     def __init__(self, stereo: RectifiedStereo, models: EstimatorModels) -> None:
-        self.sigma, self.far = models.pixel_sigma, _FAR * models.pixel_sigma
-        self.stereo, self.models = stereo, models
+        self.stereo, self.models, self.far = stereo, models, _FAR * models.pixel_sigma
         self._K = gtsam.Cal3_S2Stereo(stereo.f, stereo.f, 0.0, stereo.u0, stereo.v0, stereo.baseline)
-        self._noise = gtsam.noiseModel.Isotropic.Sigma(3, self.sigma)
+        self._noise = gtsam.noiseModel.Isotropic.Sigma(3, models.pixel_sigma)
         self._K_left = gtsam.Cal3_S2(stereo.f, stereo.f, 0.0, stereo.u0, stereo.v0)
-        self._noise_left = gtsam.noiseModel.Isotropic.Sigma(2, self.sigma)
-        self._strict, self._silent = gtsam.SmartProjectionParams(), gtsam.SmartProjectionParams()
-        self._silent.setDegeneracyMode(gtsam.DegeneracyMode.ZERO_ON_DEGENERACY)
+        self._noise_left = gtsam.noiseModel.Isotropic.Sigma(2, models.pixel_sigma)
+        self._smart = gtsam.SmartProjectionParams()
+        self._smart.setDegeneracyMode(gtsam.DegeneracyMode.ZERO_ON_DEGENERACY)
 
     def prior(self, pose: int, T: Array, covariance: Array) -> gtsam.NonlinearFactor:
         """A pose is T (4, 4) with a covariance (6, 6)."""
@@ -79,16 +78,12 @@ class FactorMaker:
         """A measurement (uL, vL, uR); uR may be NaN."""
         return gtsam.StereoPoint2(z[0], z[2], z[1])
 
-    def smart(
-        self, points: Sequence[gtsam.StereoPoint2], keys: Sequence[int], silent: bool = False
-    ) -> gtsam.NonlinearFactor:
+    def smart(self, points: Sequence[gtsam.StereoPoint2], keys: Sequence[int]) -> SmartFactor:
         """A landmark eliminated from its measurements, of which two or more are needed and one with a right pixel.
 
-        Where the measurements put it behind a camera, gtsam throws, or, of a `silent` one, takes it for no information.
-        That is right for a far landmark, which noise alone may put there. Of a near one it says that poses are wrong:
-        with all factors silent a path of a thousand frames of real tracks ran away.
+        It tells nothing, and is not valid, where the measurements put it behind a camera.
         """
-        factor = gtsam_unstable.SmartStereoProjectionPoseFactor(self._noise, self._silent if silent else self._strict)
+        factor = SmartFactor(self._noise, self._smart)
         factor.add(points, keys, self._K)
         return factor
 

@@ -19,8 +19,7 @@ from slam.data import IdArray
 from slam.errors import SlamError
 from slam.geometry.se3 import Array, adjoint, inverse, transform
 
-_ENDLESS = 1e9  # numerics: a lag that no run reaches
-_CAREFUL = 20  # numerics: poses after a failure whose factors are made so that they do not throw
+_CAREFUL = 20  # numerics: poses after a failure in which landmarks may lie behind a camera
 _FIRM = np.repeat([1e-10, 1e-8], 3)  # numerics: variances [rad²], [m²] with which the first pose is held
 
 
@@ -34,10 +33,7 @@ def solving() -> Iterator[None]:
     try:
         yield
     except (RuntimeError, ValueError, LookupError) as error:
-        why = " ".join(str(error).split())[:200] or type(error).__name__
-        if "unknown exception" in why:  # so gtsam says, of a strict factor (`FactorMaker.smart`)
-            why = "a near landmark lies behind a camera that measured it"
-        raise SolverError(f"gtsam: {why}") from error
+        raise SolverError(f"gtsam: {' '.join(str(error).split())[:200] or type(error).__name__}") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +72,7 @@ class Graph:
         self.number = -1
         self._taken = 0  # rows of that pose that are in it: landmarks are added after an update
         self.to_state = np.eye(4)
-        self._careful = 0  # number of the first pose whose factors may throw again, after a failure
+        self._careful = 0  # number of the first pose after a failure in which no near landmark may lie behind
 
     def update(self, s: SmootherState) -> tuple[Solved, str]:
         """The solution for a state with more poses than the last one; and why gtsam failed, if it did.
@@ -100,9 +96,8 @@ class Graph:
         parameters.relinearizeSkip = 1
         parameters.setRelinearizeThreshold(0.01)
         parameters.findUnusedFactorSlots = True
-        self._solver = gtsam.IncrementalFixedLagSmoother(
-            _ENDLESS if self._lag is None else float(self._lag), parameters
-        )
+        lag = np.inf if self._lag is None else float(self._lag)
+        self._solver = gtsam.IncrementalFixedLagSmoother(lag, parameters)
         self._tracks = Tracks(self._make)
         self._careful = max(self._careful, s.number + 1)
         oldest, self.number, self._revisions = s.oldest(self._lag, s.number), -1, s.revisions
@@ -125,7 +120,7 @@ class Graph:
             self._tracks.add_rows(update, s, number, begin)
             self._taken = len(s.sights[s.of(number)])
         kept = self._tracks.keep(update, s)
-        made = self._tracks.make_smart(update, s.number < self._careful)
+        made = self._tracks.make_smart(update)
         # Two steps of Gauss and Newton. What leaves the lag fixes where its neighbours stay linearised, and that is to
         # be where they are once the newest pose is solved for: without timestamps, nothing leaves in the first step.
         with solving():
@@ -135,6 +130,8 @@ class Graph:
                 self._solver.update()
             self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), update.timestamps)
             values = self._solver.calculateEstimate()
+        if s.number >= self._careful and self._tracks.contradicted():
+            raise SolverError("a near landmark lies behind a camera that measured it")
         for track, place in made:
             track.slot = slots[place]
         self._tracks.forget(s, oldest)

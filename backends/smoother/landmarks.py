@@ -73,7 +73,8 @@ class SmootherLandmarks(LandmarkRows):
         takes this measurement as well, unless its first pose has left the graph.
         """
         since, half = self.since[rows], max(track // 2, 1)
-        longer = (last >= 0) & (0 <= solved < tick - 1) & (since > solved - track) & (self.serial[rows] // 2 % 2 == 0)
+        every_other = self.serial[rows] // 2 % 2 == 0  # of all spans, even and odd ones
+        longer = (last >= 0) & (0 <= solved < tick - 1) & (since > solved - track) & every_other
         anew = np.where(since <= tick - track, tick, since)
         anew = np.where((last < 0) | (last < tick - half), tick - self.serial[rows] % half, anew)
         return np.where(longer, since, anew)

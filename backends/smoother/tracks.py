@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import gtsam
 from gtsam.symbol_shorthand import L, X
 
-from backends.smoother.factors import FactorMaker, GraphUpdate
+from backends.smoother.factors import FactorMaker, GraphUpdate, SmartFactor
 from backends.smoother.state import SmootherState
 from slam.geometry.se3 import Array, transform
 
@@ -23,7 +23,8 @@ class Track:
     # whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only
     stereo: bool = False
     far: bool = False  # whether noise alone may put it behind the camera, by one of them
-    slot: int = -1  # of the factor in the solver, −1 while there is none
+    factor: SmartFactor | None = None  # None while there are too few measurements
+    slot: int = -1  # of the factor in the solver
 
 
 class Tracks:
@@ -105,17 +106,26 @@ class Tracks:
             update.factors.add(self._make.explicit(point, pose, serial))
         update.values.insert(L(serial), transform(update.to_graph, position[None])[0])
 
-    def make_smart(self, update: GraphUpdate, silent: bool) -> list[tuple[Track, int]]:
-        """The smart factors of what grew, and their places in the update; see `FactorMaker.smart`."""
+    def make_smart(self, update: GraphUpdate) -> list[tuple[Track, int]]:
+        """The smart factors of what grew, and their places in the update."""
         made = []
         for track in self._grown.values():
             if track.stereo and len(track.poses) > 1:
                 if track.slot >= 0:
                     update.removed.append(track.slot)
                 made.append((track, update.factors.size()))
-                update.factors.add(self._make.smart(track.points, track.keys, silent or track.far))
+                track.factor = self._make.smart(track.points, track.keys)
+                update.factors.add(track.factor)
         self._grown = {}
         return made
+
+    def contradicted(self) -> bool:
+        """Whether the measurements of a near landmark put it behind a camera: then poses are wrong.
+
+        Noise alone may put a far one there. gtsam takes both for no information: so a path of a thousand frames of real
+        tracks ran away.
+        """
+        return any(t.factor is not None and not t.far and not t.factor.isValid() for t in self._smart.values())
 
     def forget(self, s: SmootherState, oldest: int) -> None:
         """Forget what has left with the poses before the `oldest`: no slot is named after its factor has left."""
