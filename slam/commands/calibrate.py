@@ -89,5 +89,5 @@ def _print(found: dict[str, Any]) -> None:
         tells = f"{pairs} pairs of views" if pairs else "no pair of views far enough apart"
         tells += ": left out" if one["left_out"] else ""
         if unsolved:
-            tells += f"; in {unsolved} others too few features agree on one motion of the camera"
+            tells += f"; in {count_of(unsolved, 'other')} too few features agree on one motion of the camera"
         console.print(f"{one['sequence']}: {one['frames']} frames, {tells}", markup=False)

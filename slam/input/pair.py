@@ -116,19 +116,24 @@ def _shown(rig: StereoRig, uv_left: Array, uv_right: Array, left: NDArray, right
     tracked, status, _ = cv2.calcOpticalFlowPyrLK(left, right, a, b, winSize=size, maxLevel=0, flags=flags)
     good = (status[:, 0] > 0) & (np.abs(tracked[:, 0] - uv_right).max(axis=1) < _TOLERANCE)
     a, b = uv_left[good], tracked[good, 0].astype(float)
-    rectified, believed = _offsets(rig, a, b)[1], _SHOWN_PLAIN if plain.is_rectified else _SHOWN
-    return min(share_shown(before, rectified, believed) for before in (b[:, 1] - a[:, 1], _offsets(plain, a, b)[1]))
+    rectified, level = _offsets(rig, a, b)[1], not plain.is_rectified
+    believed, befores = _SHOWN if level else _SHOWN_PLAIN, (b[:, 1] - a[:, 1], _offsets(plain, a, b)[1])
+    return min(share_shown(before, rectified, believed, level) for before in befores)
 
 
-def share_shown(before: Array, after: Array, believed: float) -> float:
+def share_shown(before: Array, after: Array, believed: float, level: bool = False) -> float:
     """Share of the change from row differences `before` to those `after` (N,) [px] that is seen, by least squares.
 
-    1 where it is not certainly less than what is `believed`, or rows do not agree before.
+    1 where it is not certainly less than what is `believed`, or rows do not agree before. Where all rows may be off
+    alike, as by a camera that has turned by a tenth of a degree since it was calibrated, changes count but for their
+    mean: `level`.
     """
     if not np.nanmedian(np.abs(before)) < _ROWS_AGREE:
         return 1.0
     good = np.minimum(np.abs(before), np.abs(after)) < _TOLERANCE  # NaN is not
     before, change = before[good], (before - after)[good]
+    if level and len(change):
+        before, change = before - before.mean(), change - change.mean()
     whole = float(change @ change)
     if len(change) <= _SAMPLE or whole < len(change) * _MOVES**2:
         return 1.0

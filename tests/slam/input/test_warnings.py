@@ -320,6 +320,13 @@ def test_rounding_is_no_share_of_what_rectification_does():
     assert share_shown(before, 2 * before, 0.5) == pytest.approx(-1.0)
 
 
+@pytest.mark.parametrize("pitch", [-0.003, 0.003])
+def test_a_camera_that_has_turned_a_little_is_no_rectification_done_twice(pitch):
+    """Raw images whose rows are all off by as much as lenses move them were said to be rectified before."""
+    rig = slam.StereoRig(_LENS, _LENS, cv2.Rodrigues(np.array([pitch, 0.0, 0.0]))[0], RIG.b)
+    assert not lines(every(3, seen_by_both(_LENS, _LENS, np.eye(3))), rig=rig)
+
+
 def test_a_distortion_that_is_missing_is_named_before_a_rectification_done_twice(monkeypatch):
     """Raw images with a calibration without their lenses were said to be undistorted twice."""
     monkeypatch.setattr(warnings, "pair_geometry", lambda rig, *given: pair_geometry(DISTORTED, *given))
