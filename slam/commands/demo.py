@@ -25,8 +25,6 @@ from slam.sequences import open_sequence
 
 #: As real cameras differ from their calibration; with exact ones errors would be a third of what covariances claim.
 _WORLD = "synthetic:aisle?frames={}&speed=2&box=1&focal_error=0.002&turn_error=0.7"
-_WHY = "Errors / claimed σ: at 2 they are twice as large as claimed."
-
 _FRAME = "frame.png"
 _SECONDS = 0.07  # of a frame, about
 
@@ -67,7 +65,6 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
         write_png(out / _FRAME, with_legend(draw_objects(frame.left, last, sequence.rig), last.objects))
     if not quiet:
         print_summary(summaries, [out])
-        print(_WHY)
         box = "the box in the image" if True in shown else "without the box: to find it takes more --frames"
         print(f"Open first: {out / PICTURE}; then {out / _FRAME}, {box}")
     return summaries

@@ -212,6 +212,8 @@ def _format_asked(folder: Path, query: str, text: str) -> str | None:
 
 def _hint_near(folder: Path) -> str:
     """Which sequences lie below a folder, or it is a part of; else how to name the two cameras in it."""
+    if (folder / "config.json").is_file() and (folder / "frames.csv").is_file():
+        return "; it holds a run: `slam plot` draws several in one picture, `slam view` shows one"
     with suppress(OSError, SequenceError):
         for level in range(1, _LEVELS + 1):  # 2011_09_26/…_sync, dataset/sequences/03
             inside = islice(folder.glob("/".join("*" * level)), _LOOKED_AT)

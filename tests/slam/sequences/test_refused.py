@@ -55,6 +55,12 @@ def test_calibrations_of_other_cameras(euroc, kitti, raw, two_folders):
     refused(extract, SequenceError, r"an unrectified \(extract\) drive: take the rectified")
 
 
+def test_a_folder_of_a_run_is_no_sequence(tmp_path):
+    for name in ("config.json", "frames.csv"):
+        (tmp_path / name).touch()
+    assert "left=" not in refused(tmp_path, SequenceError, "it holds a run: `slam plot` draws several in one picture")
+
+
 def test_images_that_never_pair(kitti, two_folders):
     for path in (kitti / "image_1").iterdir():
         recordings.cut(path)
