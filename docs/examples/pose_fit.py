@@ -28,7 +28,7 @@ class PoseFit:
     def update(self, observations, guess=None):
         seen, sigma = observations, self.models.pixel_sigma
         if len(seen) < 3:
-            return UpdateReport.nothing(UpdateStatus.EMPTY, "fewer than 3 landmarks", seen.ids[:0])
+            return UpdateReport.nothing(UpdateStatus.EMPTY, "fewer than 3 landmarks")
         measured = measurement_rows(seen.uv_left, seen.uv_right)
         start = self.T if guess is None else guess
         found = find_consensus(self.rig, self._places(seen.ids), measured, start, 4 * sigma, 64, seed=0)
