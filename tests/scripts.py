@@ -27,10 +27,10 @@ def load_script(name: str) -> ModuleType:
     return module
 
 
-def command(*words: object) -> str:
-    """What the command ``slam`` prints, called in this process; an error of its own is raised."""
+def command(*words: object, status: int = 0) -> str:
+    """What the command ``slam`` prints, called in this process, with its exit status; an error of its own is raised."""
     done = CliRunner().invoke(app, [*map(str, words)])
     if isinstance(done.exception, SlamError):
         raise done.exception
-    assert done.exit_code == 0, (done.output, done.exception)
+    assert done.exit_code == status, (done.output, done.exception)
     return done.output
