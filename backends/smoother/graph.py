@@ -138,7 +138,10 @@ class Graph:
         if hold:
             self.to_state = s.poses[-1] @ inverse(values.atPose3(X(s.number)).matrix())
             self._start = self.to_state @ self._start
-        return self._solution(s, oldest, kept, values)
+        solved = self._solution(s, oldest, kept, values)
+        if hold:  # to the last digit
+            solved.poses[-1] = s.poses[-1]
+        return solved
 
     def _solution(self, s: SmootherState, oldest: int, kept: list[int], values: gtsam.Values) -> Solved:
         """What gtsam found, in the state's coordinates: poses, and variables of landmarks that are `kept`."""
