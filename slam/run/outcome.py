@@ -197,11 +197,11 @@ def median_depth(features: StereoFeatures, rig: StereoRig) -> float:
 def _velocities(record: RunRecord) -> tuple[Array, BoolArray, Array]:
     """Velocities (N, 6) between measured frames in the camera's axes [rad/s, m/s], whether they count, times [s].
 
-    Where a loop or another correction of the rig moves the path, what is between is no motion.
+    Where a loop moves the path, what is between is no motion.
     """
     rows = np.flatnonzero(record.measured)
     poses, durations = np.array(record.poses).reshape(-1, 4, 4)[rows], np.diff(np.array(record.stamps)[rows])
-    whole = np.diff(np.searchsorted(record.shifted, rows, side="right")) == 0
+    whole = np.diff(np.searchsorted(record.closed, rows, side="right")) == 0
     return log(inverse(poses[:-1]) @ poses[1:]) / durations[:, None], whole, durations
 
 

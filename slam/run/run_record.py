@@ -45,7 +45,7 @@ class RunRecord:
     common: list[CommonError] = field(default_factory=list)
     with_newest: list[Array] = field(default_factory=list)  # covariances of the last poses' errors with each one's own
     measured: list[bool] = field(default_factory=list)
-    shifted: list[int] = field(default_factory=list)  # rows of the poses that a loop or another correction has moved
+    closed: list[int] = field(default_factory=list)  # rows of the poses that a loop has moved
     milliseconds: list[dict[str, float]] = field(default_factory=list)
     compiled_before: float = field(default_factory=compile_clock.seconds)  # [s]
     ages: list[float] = field(default_factory=list)  # of frames of a live run when they are done [s]
@@ -78,7 +78,7 @@ class RunRecord:
         self.map_size = result.map_size
         if not result.located:
             return
-        self.shifted += [len(self.poses)] if result.loop is not None or result.revision is not None else []
+        self.closed += [len(self.poses)] if result.loop is not None else []
         self.stamps.append(result.estimate.stamp)
         self.poses.append(result.estimate.T_world_left)
         self.covariances.append(result.estimate.covariance)

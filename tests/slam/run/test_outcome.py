@@ -107,10 +107,10 @@ def test_a_vehicle_that_goes_sideways_is_doubted():
 
 
 @pytest.mark.parametrize(
-    ("shifted", "lost", "words"), [([], [], "changes by 20 m/s"), ([], [15, 16], "changes by 6.7 m/s"), ([15], [], "")]
+    ("closed", "lost", "words"), [([], [], "changes by 20 m/s"), ([], [15, 16], "changes by 6.7 m/s"), ([15], [], "")]
 )
-def test_a_camera_that_jumps_is_doubted_but_not_where_a_correction_moves_the_path(shifted, lost, words):
-    run = along((0, 0, 0.4), shifted=shifted)
+def test_a_camera_that_jumps_is_doubted_but_not_where_a_loop_moves_the_path(closed, lost, words):
+    run = along((0, 0, 0.4), closed=closed)
     for k in lost:  # until landmarks are believed again
         run.measured[k] = False
     assert motion_doubt(run, MotionModel()) == ""

@@ -7,14 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.data import CommonError, Estimate, FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
 from slam.evaluation.summary import consistency, evaluate
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp
 from slam.geometry.trajectory import Trajectory, TruthNoise
-from slam.models import models_for
-from slam.run.outcome import motion_doubt
 from slam.run.results import figures
 from slam.run.run_record import RunRecord, results_of
 from tests.slam.numeric import chained
@@ -36,24 +32,19 @@ def estimated():
     return Trajectory(TRUTH.stamps, poses), np.array([SIGMA**2 * np.eye(6) * (k > 0) for k in range(N)])
 
 
-def result_of(k, status, pose, covariance, **more):
-    """What a system says of a frame with these."""
-    stamp, nothing = TRUTH.stamps[k], np.zeros(0, np.intp)
-    estimate = Estimate(stamp, pose, covariance, NONE, np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    report, features = UpdateReport(UpdateStatus.OK, "", NONE, NONE, 20.0, 10), StereoFeatures.empty(stamp)
-    return FrameResult(
-        k, status, "", estimate, report, features, 0, NONE, nothing, NONE, nothing, NONE, 7, {"update": 1.0}, **more
-    )
-
-
 def measured(statuses):
     """Figures of a run whose frames have these statuses, far off where they are not measured."""
     path, covariances = estimated()
-    poses, record = path.poses.copy(), RunRecord()
+    poses, record, nothing = path.poses.copy(), RunRecord(), np.zeros(0, np.intp)
     for k in range(N):
         status = statuses.get(k, FrameStatus.STARTED if k == 0 else FrameStatus.TRACKED)
         poses[k, :3, 3] += 5.0 * (k in statuses)
-        record.add(k, result_of(k, status, poses[k], covariances[k]))
+        estimate = Estimate(path.stamps[k], poses[k], covariances[k], NONE, np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        report = UpdateReport(UpdateStatus.OK, "", NONE, NONE, 20.0, 10)
+        features = StereoFeatures.empty(path.stamps[k])
+        record.add(k, FrameResult(
+            k, status, "", estimate, report, features, 0, NONE, nothing, NONE, nothing, NONE, 7, {"update": 1.0}
+        ))  # fmt: skip
     summary = {"frames": N, "status": {name: record.statuses.count(name) for name in record.statuses}}
     final = Trajectory(path.stamps, poses)
     summary |= results_of(SEQUENCE, SimpleNamespace(landmarks=None), record, final, None)
@@ -104,16 +95,3 @@ def test_truth_that_begins_after_the_first_image_is_judged_from_there_and_a_wron
     late.ground_truth.poses[:, :3, 3] *= 1000.0
     found = results_of(late, SimpleNamespace(), record, final, None)
     assert "is it in mm?" in found["truth_doubt"] == caplog.messages[-1] and "mean NEES" not in found["consistency"]
-
-
-@pytest.mark.parametrize("corrected", [False, True])
-def test_where_the_rig_s_correction_moves_the_path_nothing_is_torn(corrected):
-    """Speed on a drive changes with the disparities' error at once; images were said to be missing."""
-    record, model = RunRecord(), RigModel(StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.5, 320, 240))
-    no = RigCorrection(model, np.zeros(len(model.names)))
-    for k in range(N):
-        pose = exp(np.array([0, 0, 0, 0, 0, 1.45 * k if k < 5 else 1.45 * 4 + 1.2 * (k - 4)]))
-        revision = Revision(no, no) if corrected and k == 5 else None
-        record.add(k, result_of(k, FrameStatus.TRACKED, pose, np.eye(6), revision=revision))
-    said = motion_doubt(record, models_for("driving").motion, driving=True)
-    assert bool(said) != corrected and ("images are missing" in said) != corrected
