@@ -40,7 +40,7 @@ def calibrate(
 ) -> None:
     """Run recordings of one rig; write and print what they say of it, see `slam.run.calibrating`.
 
-    The exit status is 1 where they do not tell how good the calibration is, which a warning explains.
+    The exit status is 1 where a warning says why the result cannot be trusted.
     """
     twice = next((text for k, text in enumerate(texts) if text in texts[:k]), None)
     if twice is not None:
