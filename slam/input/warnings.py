@@ -86,16 +86,19 @@ class InputWarnings:
         if looked_at and not self._pair_warned:
             self._check_pair(frame, features)
         self._before = None if self._pair_is_right or self._pair_warned else frame
-        if len(self._stamps) <= _INTERVALS:
-            self._stamps.append(features.stamp)
-            if len(self._stamps) > _INTERVALS:
-                self._check_intervals(float(np.median(np.diff(self._stamps))))
         leap, self._last_stamp = features.stamp - self._last_stamp, features.stamp
-        if leap >= _LEAP and len(self._stamps) > _INTERVALS and not self._leapt:
+        what = f"frame {frame.index}: its stamp is"
+        if len(self._stamps) <= _INTERVALS:  # whose median tells the unit
+            self._stamps.append(features.stamp)
+            intervals, leap = np.diff(self._stamps), 0.0
+            if len(self._stamps) > _INTERVALS:
+                self._check_intervals(float(np.median(intervals)))
+                leap, what = float(intervals.max()), f"before frame {frame.index}: a stamp is"
+        if leap >= _LEAP and not self._leapt:
             self._leapt = True
             self._warn(
-                f"frame {frame.index}: its stamp is {leap:.4g} s after that of the frame before: if the clock was set "
-                "there, correct the stamps; else nothing is known of the motion in that time"
+                f"{what} {leap:.4g} s after that of the frame before: if the clock was set there, correct the stamps; "
+                "else nothing is known of the motion in that time"
             )
         if not self._texture_warned:
             self._check_texture(frame.left, len(features))

@@ -204,6 +204,8 @@ def _format_asked(folder: Path, query: str, text: str) -> str | None:
         if folder.suffix.lower() in VIDEO_SUFFIXES:
             two = f"two are {folder.parent}?left=…&right=…"
             hint = f"; a video with both images side by side is {folder}?layout=sbs, {two}"
+        elif folder.suffix == ".npz":
+            hint = "; recorded features are run by `slam replay`"
         raise SequenceError(f"{folder}: a file where the sequence's folder should be{hint}")
     if folder.is_dir() and not any(folder.iterdir()):
         raise SequenceError(f"{folder}: the folder is empty")

@@ -117,7 +117,7 @@ def rig_of(entries: Entries, source: Path, size: Size | None, options: Mapping[s
         raise ConfigurationError(f"option 'fisheye' does nothing with {source}: by it the images have no distortion")
     expected = recorded_size(rig)
     if size not in (None, expected):
-        raise SequenceError(f"images are {size_text(size or ())}, but {source} is for {size_text(expected)}")
+        raise SequenceError(f"images are {size_text(size or ())}, those of {source} are {size_text(expected)}")
     return rig
 
 

@@ -168,6 +168,9 @@ SAID = {
         stamped(0.1 * np.arange(20) + 3600.0 * (np.arange(20) > 9) + 7200.0 * (np.arange(20) > 15)), {},
         "^frame 10: its stamp is 3600 s after that of the frame before: if the clock was set there",
     ),
+    "an hour at the start": (
+        stamped(0.1 * np.arange(9) + 3600.0 * (np.arange(9) > 2)), {}, "^before frame 5: a stamp is 3600 s after"
+    ),
     "no texture": (
         every(12), {"features": 3}, r"hardly anything to follow \(3 features in frame 4, grey values from "
     ),

@@ -47,12 +47,17 @@ def test_calibrations_of_other_cameras(euroc, kitti, raw, two_folders):
         assert name in refused(folder, CalibrationError, "are the cameras swapped")
     entries = {**recordings.stereo_entries(), "image_width": 640, "image_height": 480}
     recordings.write_storage(two_folders / "calibration.yaml", entries)
-    refused(two_folders, SequenceError, r"images are 64x48, but .*calibration\.yaml is for 640x480")
+    refused(two_folders, SequenceError, r"images are 64x48, those of .*calibration\.yaml are 640x480")
     for path in raw.rglob("*.png"):
         recordings.write_image(path, 0, width=74, height=58)
-    refused(raw, SequenceError, r"images are 74x58, but .*cam_to_cam\.txt is for 64x48")
+    refused(raw, SequenceError, r"images are 74x58, those of .*cam_to_cam\.txt are 64x48")
     extract = raw.rename(raw.parent / raw.name.replace("sync", "extract"))
     refused(extract, SequenceError, r"an unrectified \(extract\) drive: take the rectified")
+
+
+def test_recorded_features_are_no_sequence(tmp_path):
+    (tmp_path / "tape.npz").touch()
+    refused(tmp_path / "tape.npz", SequenceError, "recorded features are run by `slam replay`")
 
 
 def test_a_folder_of_a_run_is_no_sequence(tmp_path):
