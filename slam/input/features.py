@@ -221,7 +221,10 @@ class Rectification:
         """The last poses of the rig's own left camera, with their joint covariance; None of none."""
         if self._none or recent is None:
             return recent
-        J = np.kron(np.eye(len(recent)), self._adjoint)
+        n = len(recent)
+        blocks = np.zeros((n, 6, n, 6))
+        blocks[np.arange(n), :, np.arange(n)] = self._adjoint
+        J = blocks.reshape(6 * n, 6 * n)
         return RecentPoses(recent.stamps, recent.poses @ self._back, J @ recent.covariance @ J.T)
 
     def path_out(self, path: Trajectory) -> Trajectory:

@@ -48,10 +48,9 @@ def follow(
     Tracks whose `pixels` (M, 2) are not finite are not matched. The windows are ellipses of the innovations'
     covariances (M, 2, 2) [px²]. Features that are `taken` (N,) are no candidates.
     """
-    order = np.argsort(features.uv_left[:, 0], kind="stable")
-    order = order if taken is None else order[~taken[order]]
+    order = features.by_column if taken is None else features.by_column[~taken[features.by_column]]
     sizes, pairs = np.array(windows.sizes), np.empty((2, len(pixels)), np.intp)
-    least = np.broadcast_to(windows.least, len(pixels)) / sizes[0]
+    least = np.full(len(pixels), windows.least) / sizes[0]
     count = _follow(
         np.ascontiguousarray(pixels), np.ascontiguousarray(innovation), least, windows.most / sizes[0], sizes,
         np.array(windows.d_match, np.float32), np.float32(windows.ratio), np.ascontiguousarray(descriptors), laplacian,
