@@ -109,7 +109,7 @@ class StereoFeatures:
     @cached_property
     def has_stereo(self) -> BoolArray:
         """Which features have a right pixel (N,)."""
-        return np.asarray(np.isfinite(self.uv_right).all(axis=1))
+        return np.isfinite(self.uv_right[:, 0]) & np.isfinite(self.uv_right[:, 1])
 
     @cached_property
     def by_column(self) -> IndexArray:

@@ -110,7 +110,9 @@ def pose(R: Array, t: Array) -> Array:
 def inverse(T: Array) -> Array:
     """Inverse poses (..., 4, 4)."""
     if T.ndim == 2:
-        return pose(T[:3, :3].T, -(T[:3, 3] @ T[:3, :3]))
+        out, R = np.empty((4, 4)), T[:3, :3]
+        out[:3, :3], out[:3, 3], out[3] = R.T, -(T[:3, 3] @ R), (0.0, 0.0, 0.0, 1.0)
+        return out
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
     return pose(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
 
@@ -185,10 +187,12 @@ def _polynomial(w: list[float], a: float, b: float) -> list[list[float]]:
 
 def _is_rotation(R: list[list[float]], tolerance: float) -> bool:
     (a, b, c), (d, e, f), (g, h, i) = R
-    lengths = a * a + b * b + c * c - 1, d * d + e * e + f * f - 1, g * g + h * h + i * i - 1
-    angles = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
-    close = all(-tolerance <= value <= tolerance for value in (*lengths, *angles))  # false for NaN, too
-    return close and a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0
+    return (  # false for NaN, too
+        abs(a * a + b * b + c * c - 1) <= tolerance and abs(a * d + b * e + c * f) <= tolerance
+        and abs(d * d + e * e + f * f - 1) <= tolerance and abs(d * g + e * h + f * i) <= tolerance
+        and abs(g * g + h * h + i * i - 1) <= tolerance and abs(g * a + h * b + i * c) <= tolerance
+        and a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0
+    )  # fmt: skip
 
 
 def _quaternion(R: list[list[float]]) -> tuple[float, float, float, float]:

@@ -30,7 +30,9 @@ class Rows(Table):
     def of(cls, pose: IndexArray | int, point: IndexArray, z: Array, sigma: float) -> Rows:
         """Measurements with independent noise of each pixel, `sigma` [px], from one pose or from poses (M,)."""
         n = len(point)
-        return cls(np.full(n, pose), point, z, np.repeat((np.eye(3) / sigma)[None], n, axis=0))
+        root = np.zeros((n, 3, 3))
+        root[:] = np.eye(3) / sigma
+        return cls(np.full(n, pose), point, z, root)
 
     @classmethod
     @cache
