@@ -55,17 +55,15 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
     for name, wanted in attributes.items():
         value, where = getattr(answer, name), what if name == "real" else f"{what}: {name}"
         if isinstance(wanted, tuple):
-            shape = value.shape if isinstance(value, np.ndarray) else ()
-            numeric = isinstance(value, np.ndarray) and value.dtype.kind in "fiu"
-            if numeric and len(shape) == len(wanted):
-                for letter, size in zip(wanted, shape):
-                    if isinstance(letter, str):
-                        sizes.setdefault(letter, size)
-                        sizes.setdefault(f"6{letter}", 6 * size)
-            expected = tuple(map(sizes.get, wanted, wanted))
-            if not numeric or shape != expected:
-                got = f"{value.dtype} {shape}" if isinstance(value, np.ndarray) else type(value).__name__
-                raise AnswerError(f"{where} must be an array {expected} of numbers, got {got}".replace("'", ""))
+            shape = value.shape if isinstance(value, np.ndarray) and value.dtype.kind in "fiu" else None
+            if shape != wanted:
+                for letter, size in zip(wanted, shape if shape and len(shape) == len(wanted) else ()):
+                    if isinstance(letter, str) and letter not in sizes:
+                        sizes[letter], sizes[f"6{letter}"] = size, 6 * size
+                expected = tuple(map(sizes.get, wanted, wanted))
+                if shape != expected:
+                    got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+                    raise AnswerError(f"{where} must be an array {expected} of numbers, got {got}".replace("'", ""))
             if name in _IDS and value.dtype.kind not in "iu":
                 raise AnswerError(f"{where} must be an array of ids, got {value.dtype}")
             if name in _POSES and is_rigid(value, 1e-3):

@@ -65,8 +65,9 @@ def changed(data: _D, **values: Any) -> _D:
 
     What the original has computed and kept is found anew.
     """
-    new, names = object.__new__(type(data)), data.__dataclass_fields__  # type: ignore[attr-defined]
-    vars(new).update(zip(names, map(vars(data).__getitem__, names)), **values)
+    new, names, own = object.__new__(type(data)), data.__dataclass_fields__, vars(data)  # type: ignore[attr-defined]
+    own = own if len(own) == len(names) else {name: own[name] for name in names}
+    vars(new).update(own, **values)
     return new
 
 

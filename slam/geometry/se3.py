@@ -110,9 +110,7 @@ def pose(R: Array, t: Array) -> Array:
 def inverse(T: Array) -> Array:
     """Inverse poses (..., 4, 4)."""
     if T.ndim == 2:
-        out, R = np.empty((4, 4)), T[:3, :3]
-        out[:3, :3], out[:3, 3], out[3] = R.T, -(T[:3, 3] @ R), (0.0, 0.0, 0.0, 1.0)
-        return out
+        return pose(T[:3, :3].T, -(T[:3, 3] @ T[:3, :3]))
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
     return pose(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
 

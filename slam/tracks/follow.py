@@ -68,7 +68,7 @@ def match_everywhere(
     """
     best, limits = np.full(len(descriptors), -1), (np.float32(d_match), np.float32(ratio))
     for sign in (-1, 0, 1):
-        rows, columns = (np.flatnonzero(signs == sign) for signs in (laplacian, features.laplacian))
+        rows, columns = (laplacian == sign).nonzero()[0], (features.laplacian == sign).nonzero()[0]
         if len(rows) and len(columns):
             found = mutual_best(descriptors[rows] @ features.descriptors[columns].T, *limits)
             best[rows] = np.where(found < 0, -1, columns[found])

@@ -212,8 +212,8 @@ class Tracks(LandmarkTable):
 
     def count(self, rows: IndexArray) -> IdArray:
         """Number of measurements of tracks in the window (M,)."""
-        measured = self.dof.take(rows, axis=0) != 0
-        return np.asarray(measured @ np.ones(measured.shape[1], np.int64))  # `count_nonzero` takes half as long again
+        measured = (self.dof.take(rows, axis=0) != 0).astype(np.float32)
+        return (measured @ np.ones(measured.shape[1], np.float32)).astype(np.int64)  # a sum takes thrice as long
 
     def set_features(self, rows: IndexArray, features: IndexArray) -> None:
         """Rows (K,) are found as these features, in place; of rows alike to the bit, the first has the feature."""
