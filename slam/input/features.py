@@ -221,10 +221,8 @@ class Rectification:
         """The last poses of the rig's own left camera, with their joint covariance; None of none."""
         if self._none or recent is None:
             return recent
-        n = len(recent)
-        blocks = np.zeros((n, 6, n, 6))
-        blocks[np.arange(n), :, np.arange(n)] = self._adjoint
-        J = blocks.reshape(6 * n, 6 * n)
+        each, J = np.arange(len(recent)), np.zeros((6 * len(recent),) * 2)
+        J.reshape(len(each), 6, len(each), 6)[each, :, each] = self._adjoint
         return RecentPoses(recent.stamps, recent.poses @ self._back, J @ recent.covariance @ J.T)
 
     def path_out(self, path: Trajectory) -> Trajectory:

@@ -19,16 +19,7 @@ from slam.kernels.se3 import move, transform_back
 from slam.kernels.stereo import residual
 from slam.runtime.compilation import helper, kernel
 from slam.window.chart_kernels import charts, displace
-from slam.window.terms import (
-    ELIMINATED,
-    KNOWN,
-    add_motion,
-    add_own_priors,
-    add_prior,
-    add_rows,
-    sees,
-    whitened_residual,
-)
+from slam.window.terms import ELIMINATED, add_motion, add_own_priors, add_prior, add_rows, sees, whitened_residual
 
 _HALVINGS = 8  # numerics: of a step that does not lessen the cost
 _NEAR = 50.0  # numerics: a step with a factor of its own is the last at this many times `close`: it leaves the square
@@ -217,43 +208,6 @@ def gauss_newton(camera, poses, points, layout, knowledge, centre, n, huber, clo
             break
         whole = fresh
     return poses, points, cost, minimum, L, H, linearised
-
-
-@kernel
-def arranged(poses, free, count, known, members, of_prior, relative, rows, places):
-    """Where unknowns of `poses` and of `count` points stand, as `slam.window.problem.Layout` says, and their number.
-
-    `free` (K,) and `known` (N,) are masks, without rows for all and none; `members` are points that are unknowns, in
-    their order, those `of_prior` among them; the prior is of as many poses as `relative`. `rows` and `places` name
-    their poses and points.
-    """
-    column, place, of_rows = np.full(poses, -1), np.full(count, ELIMINATED), len(rows[0])
-    pose_of, point = np.empty(of_rows + len(places[0]), np.int64), np.empty(of_rows + len(places[0]), np.int64)
-    for p in range(len(known)):
-        if known[p]:
-            place[p] = KNOWN
-    for d in range(len(members)):
-        place[members[d]] = d
-    n, to = 3 * len(members), np.empty(3 * len(of_prior) + 6 * relative, np.int64)
-    for i in range(len(to)):
-        d = i - 3 * len(of_prior)
-        to[i] = n + d if d >= 0 else 3 * place[of_prior[i // 3]] + i % 3
-    for k in range(poses):
-        if len(free) == 0 or free[k]:
-            column[k] = n
-            n += 6
-    first, order, at = np.zeros(count + 1, np.int64), np.empty(len(point), np.int64), np.empty(count, np.int64)
-    for m in range(len(point)):
-        part, row = (rows, m) if m < of_rows else (places, m - of_rows)
-        pose_of[m], point[m] = part[0][row], part[1][row]
-        first[point[m] + 1] += 1
-    for p in range(count):
-        at[p] = first[p]
-        first[p + 1] += first[p]
-    for m in range(len(point)):
-        order[at[point[m]]] = m
-        at[point[m]] += 1
-    return column, place, to, pose_of, first, order, n
 
 
 @kernel

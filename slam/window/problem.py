@@ -10,7 +10,6 @@ import numpy as np
 
 from slam.geometry.arrays import Array, BoolArray, IndexArray, Table
 from slam.window import chart_kernels, terms
-from slam.window.kernels import arranged
 from slam.window.stereo import RectifiedStereo
 
 KNOWN, ELIMINATED = terms.KNOWN, terms.ELIMINATED
@@ -209,7 +208,7 @@ class Window:
             order, skipped = np.argsort(asked, kind="stable"), len(asked) - int(np.count_nonzero(asked))
             members, basis = members[order], basis[order]
         known, free = (_ANY if mask is None else mask for mask in (self.known, self.free))
-        column, place, to, pose_of, first, order, n = arranged(
+        column, place, to, pose_of, first, order, n = terms.arranged(
             len(self.poses), free, len(self.points), known, members, prior.points, len(prior.relative),
             self.rows.arrays[:2], self.places.arrays[:2],
         )  # fmt: skip
