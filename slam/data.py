@@ -109,7 +109,12 @@ class StereoFeatures:
     @cached_property
     def has_stereo(self) -> BoolArray:
         """Which features have a right pixel (N,)."""
-        return np.asarray(np.isfinite(self.uv_right).all(axis=1))
+        return np.isfinite(self.uv_right[:, 0]) & np.isfinite(self.uv_right[:, 1])
+
+    @cached_property
+    def by_column(self) -> IndexArray:
+        """Rows of the features from left to right in the left image (N,)."""
+        return self.uv_left[:, 0].argsort(kind="stable")
 
     def select(self, rows: NDArray) -> StereoFeatures:
         """The features of these rows (a mask or indices)."""
@@ -146,12 +151,13 @@ class Observations(Table):
             raise MeasurementError(f"observations: {n} ids, but uv_left is {shapes[0]} and uv_right {shapes[1]}")
         if not (self.ids[1:] > self.ids[:-1]).all() and len(np.unique(self.ids)) != n:  # they mostly ascend
             raise MeasurementError("observations: a landmark id stands twice")
+        if (np.abs(self.uv_left) <= FARTHEST_PIXEL).all() and not (np.abs(self.uv_right) > FARTHEST_PIXEL).any():
+            return  # NaN compares false
         if not np.isfinite(self.uv_left).all():
             raise MeasurementError("observations: a left pixel is not finite")
         if np.isinf(self.uv_right).any():
             raise MeasurementError("observations: a right pixel is infinite; NaN says that there is none")
-        if n and max(np.abs(self.uv_left).max(), np.abs(np.nan_to_num(self.uv_right)).max()) > FARTHEST_PIXEL:
-            raise MeasurementError(f"observations: a pixel lies more than {FARTHEST_PIXEL:g} px off: in no image")
+        raise MeasurementError(f"observations: a pixel lies more than {FARTHEST_PIXEL:g} px off: in no image")
 
     __repr__ = of_shapes
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from slam.checks import LATEST_STAMP, is_rigid
-from slam.data import Estimate, Observations, Patches, Prediction, RecentPoses, UpdateReport, UpdateStatus
+from slam.data import Estimate, Patches, Prediction, RecentPoses, UpdateReport, UpdateStatus
 from slam.errors import AnswerError, PartError, SlamError, cause
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
@@ -55,21 +55,22 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
     for name, wanted in attributes.items():
         value, where = getattr(answer, name), what if name == "real" else f"{what}: {name}"
         if isinstance(wanted, tuple):
-            shape, numeric = np.shape(value), isinstance(value, np.ndarray) and value.dtype.kind in "fiu"
-            if numeric and len(shape) == len(wanted):
-                for letter, size in zip(wanted, shape):
-                    if isinstance(letter, str):
-                        sizes.setdefault(letter, size)
-                        sizes.setdefault(f"6{letter}", 6 * size)
-            expected = tuple(map(sizes.get, wanted, wanted))
-            if not numeric or shape != expected:
-                got = f"{value.dtype} {shape}" if isinstance(value, np.ndarray) else type(value).__name__
-                raise AnswerError(f"{where} must be an array {expected} of numbers, got {got}".replace("'", ""))
+            shape = value.shape if isinstance(value, np.ndarray) and value.dtype.kind in "fiu" else None
+            if shape != wanted:
+                for letter, size in zip(wanted, shape if shape and len(shape) == len(wanted) else ()):
+                    if isinstance(letter, str) and letter not in sizes:
+                        sizes[letter], sizes[f"6{letter}"] = size, 6 * size
+                expected = tuple(map(sizes.get, wanted, wanted))
+                if shape != expected:
+                    got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+                    raise AnswerError(f"{where} must be an array {expected} of numbers, got {got}".replace("'", ""))
             if name in _IDS and value.dtype.kind not in "iu":
                 raise AnswerError(f"{where} must be an array of ids, got {value.dtype}")
+            if name in _POSES and is_rigid(value, 1e-3):
+                continue
             if name in _FINITE and not np.isfinite(value).all():
                 raise AnswerError(f"{where} is not finite")
-            if name in _POSES and not is_rigid(value, 1e-3):
+            if name in _POSES:
                 raise AnswerError(f"{where} is no rotation and translation")
             if name in _COVARIANCES and (value.diagonal(0, -2, -1) < -1e-9).any():  # 1e-9: rounding
                 raise AnswerError(f"{where} has a negative variance")
@@ -90,9 +91,9 @@ class OnlinePose:
     landmarks: Array  # that measured it, in camera coordinates (M, 3) [m]
 
     @classmethod
-    def seen(cls, rig: StereoRig, sigma: float, estimate: Estimate, seen: Observations) -> OnlinePose:
-        """By what was measured of landmarks."""
-        local = rig.triangulate(seen.uv_left, seen.uv_right)
+    def seen(cls, rig: StereoRig, sigma: float, estimate: Estimate, uv_left: Array, uv_right: Array) -> OnlinePose:
+        """By the pixels (M, 2) of what was measured of landmarks, the right ones NaN where there is no stereo match."""
+        local = rig.triangulate(uv_left, uv_right)
         return cls(rig, sigma, estimate, local[np.isfinite(local[:, 0])])
 
     @cached_property

@@ -234,9 +234,8 @@ class Tracker:
         """The camera's pose after an update; the rig's calibration learns from the frame."""
         self.calibration.observe(changed(step.measured, images=None), step.pose)
         estimate: Estimate = checked(state.backend, "estimate", state.backend.estimate(landmarks=False))
-        seen = step.matches.observations(step.features)
-        seen = seen.select(np.isin(seen.ids, step.report.used))
-        online = OnlinePose.seen(self.rig, self.config.models.pixel_sigma, estimate, seen)
+        rows, f = step.matches.rows[isin(step.matches.ids, step.report.used)], step.features
+        online = OnlinePose.seen(self.rig, self.config.models.pixel_sigma, estimate, f.uv_left[rows], f.uv_right[rows])
         path = (*state.online[-FRAMES:], online)
         return changed(step, estimate=estimate, online=path, recent=recent_of(state.backend, path))
 

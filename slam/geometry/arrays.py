@@ -33,9 +33,10 @@ def narrowed(values: np.ndarray, dtype: type[np.floating[Any]]) -> NDArray[Any]:
 
 def isin(ids: IdArray | IndexArray, members: IdArray | IndexArray) -> BoolArray:
     """Which of `ids` (N,) are among `members` (M,): ``np.isin``, which takes several times as long for so few."""
-    if len(ids) + len(members) > 2 * 500:  # 500: NumPy is quicker with more
-        return np.isin(ids, members)
-    return np.fromiter(map(set(members.tolist()).__contains__, ids.tolist()), bool, len(ids))
+    if not len(members):
+        return np.zeros(len(ids), bool)
+    ordered = np.sort(members)
+    return np.asarray(ordered[np.minimum(ordered.searchsorted(ids), len(ordered) - 1)] == ids)
 
 
 def among(count: int, rows: IndexArray | IdArray) -> BoolArray:
@@ -64,8 +65,9 @@ def changed(data: _D, **values: Any) -> _D:
 
     What the original has computed and kept is found anew.
     """
-    new, fields = object.__new__(type(data)), vars(data)
-    vars(new).update({name: fields[name] for name in data.__dataclass_fields__}, **values)  # type: ignore[attr-defined]
+    new, names, own = object.__new__(type(data)), data.__dataclass_fields__, vars(data)  # type: ignore[attr-defined]
+    own = own if len(own) == len(names) else {name: own[name] for name in names}
+    vars(new).update(own, **values)
     return new
 
 
@@ -74,26 +76,20 @@ class Table:
     """Arrays with as many rows each; those that derive from it name them as their fields."""
 
     @property
-    def columns(self) -> list[Any]:
-        """All arrays."""
-        values = vars(self)
-        return [values[name] for name in self.__dataclass_fields__]
-
-    @property
     def arrays(self) -> tuple[Any, ...]:
-        """The same, as compiled code takes them."""
-        return tuple(self.columns)
+        """All arrays, as compiled code takes them."""
+        return tuple(map(vars(self).__getitem__, self.__dataclass_fields__))
 
     def __len__(self) -> int:
         return len(getattr(self, next(iter(self.__dataclass_fields__))))
 
     def select(self, rows: Any) -> Self:
         """Some of the rows: a mask, indices, or a slice."""
-        return type(self)(*(column[rows] for column in self.columns))
+        return type(self)(*[column[rows] for column in self.arrays])
 
     def joined(self, other: Self) -> Self:
         """These rows, then others."""
-        return type(self)(*(np.concatenate(pair) for pair in zip(self.columns, other.columns)))
+        return type(self)(*map(np.concatenate, zip(self.arrays, other.arrays)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,20 +101,21 @@ class LandmarkRows(Table):
     @cached_property
     def order(self) -> IndexArray:
         """Rows of the landmarks in the map, by ascending id."""
-        rows = np.argsort(self.ids, kind="stable")
-        return np.asarray(rows[np.searchsorted(self.ids[rows], 0) :])
+        rows = self.ids.argsort(kind="stable")
+        return rows[self.ids[rows].searchsorted(0) :]
 
     def rows_of(self, ids: IdArray | Sequence[int]) -> IndexArray:
         """Rows (M,) of landmarks; MeasurementError where one is not in the map."""
-        ids, present = np.asarray(ids, np.int64), self.ids[self.order]
-        at = np.searchsorted(present, ids).clip(0, max(len(present) - 1, 0))
-        bad = present[at] != ids if len(present) else np.ones(len(ids), bool)
+        ids, order = np.asarray(ids, np.int64), self.order
+        present = self.ids[order]
+        at = np.minimum(present.searchsorted(ids), len(order) - 1)
+        bad = present[at] != ids if len(order) else np.ones(len(ids), bool)
         if bad.any():
             raise MeasurementError(f"landmark {ids[bad][0]} is not in the map")
-        return self.order[at]
+        return order[at]
 
     def require_new(self, ids: IdArray) -> None:
         """Raise MeasurementError where a landmark is in the map already."""
-        taken = np.isin(ids, self.ids)
+        taken = isin(ids, self.ids)
         if taken.any():
             raise MeasurementError(f"landmark {ids[taken][0]} is in the map already")

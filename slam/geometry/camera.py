@@ -128,9 +128,13 @@ class PinholeCamera:
 
     def project(self, points: Array) -> Array:
         """Pixels (N, 2) of points (N, 3) [m] in camera coordinates; NaN for points not in front of the camera."""
-        points = np.asarray(points, float).reshape(-1, 3)
-        ab = points[:, :2] / np.where(points[:, 2:] > _NEAREST, points[:, 2:], np.nan)
-        return np.asarray(self._distort(ab) * (self.fu, self.fv) + (self.u0, self.v0))
+        points = np.ascontiguousarray(points, float).reshape(-1, 3)
+        if self.model == "equidistant":
+            ab = points[:, :2] / np.where(points[:, 2:] > _NEAREST, points[:, 2:], np.nan)
+            return np.asarray(self._distort_fisheye(ab) * (self.fu, self.fv) + (self.u0, self.v0))
+        from slam.geometry import kernels
+
+        return np.asarray(kernels.project(points, *self._lens, _NEAREST))
 
     def normalise(self, uv: Array) -> Array:
         """Undistorted normalised coordinates (N, 2) = (x/z, y/z) of pixels (N, 2); NaN stays NaN."""
@@ -153,26 +157,23 @@ class PinholeCamera:
         """Which points (N, 3) are in the angle of view: in front and inside the image (paper A, Fig. 3)."""
         return self.in_image(self.project(points))
 
-    def _distort(self, ab: Array) -> Array:
-        """Distorted normalised coordinates (N, 2).
+    def _distort_fisheye(self, ab: Array) -> Array:
+        """Distorted normalised coordinates (N, 2) of a fisheye."""
+        import cv2
 
-        Rows outside the region where the distortion is one-to-one are NaN: there the polynomial folds far rays back
-        into the image.
-        """
-        if not self.has_distortion or not len(ab):
-            return ab
-        if self.model == "equidistant":
-            import cv2
+        lens = np.array(self.distortion)
+        return np.asarray(cv2.fisheye.distortPoints(ab[:, None], np.eye(3), lens)[:, 0]) if len(ab) else ab
 
-            return np.asarray(cv2.fisheye.distortPoints(ab[:, None], np.eye(3), np.array(self.distortion))[:, 0])
-        from slam.geometry import kernels
-
-        return np.asarray(kernels.distort(np.ascontiguousarray(ab), self._coefficients, self._radius_limit))
+    @cached_property
+    def _lens(self) -> tuple[Array, bool, Array, float]:
+        """What compiled code projects by: (fu, fv, u0, v0), whether rays are distorted, coefficients, and the limit."""
+        pinhole = np.array([self.fu, self.fv, self.u0, self.v0], float)
+        return pinhole, self.has_distortion, self._coefficients, self._radius_limit
 
     @cached_property
     def _coefficients(self) -> Array:
         """Of the Brown-Conrady model (8,), those that are not given are zero."""
-        return np.array([*self.distortion, *[0.0] * (8 - len(self.distortion))])
+        return np.array([*self.distortion, *[0.0] * (8 - len(self.distortion))], float)
 
     @cached_property
     def _radius_limit(self) -> float:
@@ -187,13 +188,13 @@ class PinholeCamera:
         return float(r[np.argmax(falling)]) if falling.any() else np.inf
 
     def _undistort(self, target: Array) -> Array:
-        """Invert `_distort`; NaN where no ray leads to the pixel."""
+        """Normalised coordinates (N, 2) of distorted ones; NaN where no ray leads to the pixel."""
         if self.model == "equidistant":
             import cv2
 
             until, lens = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-13), np.array(self.distortion)
             ab = cv2.fisheye.undistortPoints(target[:, None], np.eye(3), lens, criteria=until)[:, 0]
-            off = np.abs(self._distort(ab) - target).max(axis=1, keepdims=True)
+            off = np.abs(self._distort_fisheye(ab) - target).max(axis=1, keepdims=True)
             return np.where(off < 1e-9, ab, np.nan)  # 1e-9: of rays 90° or more off the axis OpenCV gives others
         from slam.geometry import kernels
 

@@ -47,15 +47,21 @@ def triangulate_rectified(camera, uv_left, uv_right):
 
 
 @kernel
-def distort(ab, coefficients, limit):
-    """Distorted normalised coordinates (N, 2); NaN beyond `limit`, where the polynomial folds rays back."""
-    out, D = np.empty_like(ab), np.empty((2, 2))
-    for i in range(len(ab)):
-        a, b = ab[i, 0], ab[i, 1]
-        if np.sqrt(a * a + b * b) > limit:
-            a = b = np.nan
-        out[i, 0], out[i, 1] = _distorted(coefficients, a, b, D)
-    return out
+def project(points, pinhole, distorts, coefficients, limit, nearest):
+    """Pixels (N, 2) of points (N, 3) in a camera with a `pinhole` (4,) = (fu, fv, u0, v0) that `distorts` or not.
+
+    They are NaN where the depth is not beyond `nearest`, and beyond `limit`, where the polynomial folds rays back.
+    """
+    uv, D = np.empty((len(points), 2)), np.empty((2, 2))
+    for i in range(len(points)):
+        z = points[i, 2] if points[i, 2] > nearest else np.nan
+        a, b = points[i, 0] / z, points[i, 1] / z
+        if distorts:
+            if np.sqrt(a * a + b * b) > limit:
+                a = b = np.nan
+            a, b = _distorted(coefficients, a, b, D)
+        uv[i, 0], uv[i, 1] = a * pinhole[0] + pinhole[2], b * pinhole[1] + pinhole[3]
+    return uv
 
 
 @kernel

@@ -90,9 +90,7 @@ def nearest_rotation(M: Array) -> Array:
 
 def is_rotation(R: Array, tolerance: float) -> BoolArray:
     """Which matrices (..., 3, 3) are rotations, to within `tolerance` in the elements of ``R Rᵀ``; none with a NaN."""
-    bounded = np.where((np.abs(R) < 2.0).all(axis=(-2, -1), keepdims=True), R, 0.0)  # else squares overflow
-    off = np.abs(bounded @ np.swapaxes(bounded, -1, -2) - np.eye(3)).max(axis=(-2, -1))
-    return np.asarray((off <= tolerance) & (np.linalg.det(bounded) > 0))
+    return _each(lambda one: _is_rotation(one, tolerance), R, (3, 3), ()).astype(bool)
 
 
 def pose(R: Array, t: Array) -> Array:
@@ -183,6 +181,16 @@ def _polynomial(w: list[float], a: float, b: float) -> list[list[float]]:
     xx, yy, zz = b * x * x, b * y * y, b * z * z
     ax, ay, az = a * x, a * y, a * z
     return [[1 - yy - zz, xy - az, xz + ay], [xy + az, 1 - xx - zz, yz - ax], [xz - ay, yz + ax, 1 - xx - yy]]
+
+
+def _is_rotation(R: list[list[float]], tolerance: float) -> bool:
+    (a, b, c), (d, e, f), (g, h, i) = R
+    return (  # false for NaN, too
+        abs(a * a + b * b + c * c - 1) <= tolerance and abs(a * d + b * e + c * f) <= tolerance
+        and abs(d * d + e * e + f * f - 1) <= tolerance and abs(d * g + e * h + f * i) <= tolerance
+        and abs(g * g + h * h + i * i - 1) <= tolerance and abs(g * a + h * b + i * c) <= tolerance
+        and a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0
+    )  # fmt: skip
 
 
 def _quaternion(R: list[list[float]]) -> tuple[float, float, float, float]:

@@ -221,7 +221,8 @@ class Rectification:
         """The last poses of the rig's own left camera, with their joint covariance; None of none."""
         if self._none or recent is None:
             return recent
-        J = np.kron(np.eye(len(recent)), self._adjoint)
+        each, J = np.arange(len(recent)), np.zeros((6 * len(recent),) * 2)
+        J.reshape(len(each), 6, len(each), 6)[each, :, each] = self._adjoint
         return RecentPoses(recent.stamps, recent.poses @ self._back, J @ recent.covariance @ J.T)
 
     def path_out(self, path: Trajectory) -> Trajectory:

@@ -33,7 +33,8 @@ class MomentWatch:
 
     def __init__(self, rig: StereoRig) -> None:
         self._rig = rig
-        self._before: tuple[Array, Array] | None = None  # pose and features of the last frame, if that was measured
+        # pose of the last frame, if that was measured, and its `_points`
+        self._before: tuple[Array, tuple[Array, Array, Array]] | None = None
         self._blocks: list[Array] = []  # sums of products (2, 7, 7) [px²], late and early, see `_products`
         self._length, self._in_last = 1, 1  # frames of a block, and of the last one
         self._whole = np.zeros((2, 7, 7))  # sum of all blocks
@@ -49,7 +50,7 @@ class MomentWatch:
         if before is None:
             return
         step = inverse(before[0]) @ T_world_left
-        sums = np.stack([self._products(self._before[1], step), self._products(before[1], inverse(step))])
+        sums = np.stack([self._products(*self._before[1], step), self._products(*before[1], inverse(step))])
         if (sums[:, 1, 1] <= _STILL**2 * sums[:, 2, 2]).any():  # also without features
             return
         self._whole += sums
@@ -79,15 +80,21 @@ class MomentWatch:
             f"images were {word} by a part of a frame or more; {ONE_MOMENT}"
         )
 
-    def _points(self, features: StereoFeatures) -> Array:
-        """Of each feature with a right pixel (N, 5): its point in the camera's axes [m], row, vertical disparity."""
+    def _points(self, features: StereoFeatures) -> tuple[Array, Array, Array]:
+        """Features with a right pixel: points in the camera's axes (N, 3) [m], rows (N,), and columns (N, 7).
+
+        The columns are the vertical disparity, one for the flow, and `_fields`.
+        """
         rows = np.flatnonzero(features.has_stereo)
         left, right = features.uv_left[rows], features.uv_right[rows]
+        columns, level = np.empty((len(rows), 7)), right.copy()
+        level[:, 1] = left[:, 1]
         with np.errstate(all="ignore"):
-            points = self._rig.triangulate(left, np.column_stack([right[:, 0], left[:, 1]]))
-        return np.column_stack([points, left[:, 1], right[:, 1] - left[:, 1]])
+            points = self._rig.triangulate(left, level)
+            columns[:, 0], columns[:, 2:] = right[:, 1] - left[:, 1], np.stack(_fields(points), axis=1)
+        return points, left[:, 1], columns
 
-    def _products(self, seen: Array, T_other_now: Array) -> Array:
+    def _products(self, points: Array, rows: Array, columns: Array, T_other_now: Array) -> Array:
         """Sums of products (7, 7) [px²] over features: of vertical disparities, of the flow, and of `_fields`.
 
         The flow is how many rows a still point moves in the left image from another frame to this one; `T_other_now`
@@ -95,9 +102,8 @@ class MomentWatch:
         of it.
         """
         with np.errstate(all="ignore"):
-            flow = seen[:, 3] - self._rig.left.project(transform(T_other_now, seen[:, :3]))[:, 1]
-            columns = np.column_stack([seen[:, 4], flow, *_fields(seen[:, :3])])
-        columns = columns[np.isfinite(columns).all(axis=1) & (np.abs(flow) < _FLOW)]
+            columns[:, 1] = rows - self._rig.left.project(transform(T_other_now, points))[:, 1]
+        columns = columns[np.isfinite(columns).all(axis=1) & (np.abs(columns[:, 1]) < _FLOW)]
         return np.asarray(columns.T @ columns)
 
 

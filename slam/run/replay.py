@@ -96,8 +96,8 @@ class Replay:
                 backend.remove(frame.removed[at_once])
         with stages.stage("estimate"):
             estimate = checked(backend, "estimate", backend.estimate(landmarks=False))
-            used = seen.select(np.isin(seen.ids, report.used))
-            self._path = [*self._path[-FRAMES:], OnlinePose.seen(inside.rig, self._sigma, estimate, used)]
+            pixels = (uv[np.isin(seen.ids, report.used)] for uv in (seen.uv_left, seen.uv_right))
+            self._path = [*self._path[-FRAMES:], OnlinePose.seen(inside.rig, self._sigma, estimate, *pixels)]
             recent = recent_of(backend, self._path)
         status, reason = _status(report, begins=not size and len(added) > 0)
         rows, unknown = np.arange(len(seen) + len(added)), np.full(len(seen) + len(added), np.nan)

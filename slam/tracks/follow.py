@@ -48,10 +48,9 @@ def follow(
     Tracks whose `pixels` (M, 2) are not finite are not matched. The windows are ellipses of the innovations'
     covariances (M, 2, 2) [px²]. Features that are `taken` (N,) are no candidates.
     """
-    order = np.argsort(features.uv_left[:, 0], kind="stable")
-    order = order if taken is None else order[~taken[order]]
+    order = features.by_column if taken is None else features.by_column[~taken[features.by_column]]
     sizes, pairs = np.array(windows.sizes), np.empty((2, len(pixels)), np.intp)
-    least = np.broadcast_to(windows.least, len(pixels)) / sizes[0]
+    least = np.full(len(pixels), windows.least) / sizes[0]
     count = _follow(
         np.ascontiguousarray(pixels), np.ascontiguousarray(innovation), least, windows.most / sizes[0], sizes,
         np.array(windows.d_match, np.float32), np.float32(windows.ratio), np.ascontiguousarray(descriptors), laplacian,
@@ -69,7 +68,7 @@ def match_everywhere(
     """
     best, limits = np.full(len(descriptors), -1), (np.float32(d_match), np.float32(ratio))
     for sign in (-1, 0, 1):
-        rows, columns = (np.flatnonzero(signs == sign) for signs in (laplacian, features.laplacian))
+        rows, columns = (laplacian == sign).nonzero()[0], (features.laplacian == sign).nonzero()[0]
         if len(rows) and len(columns):
             found = mutual_best(descriptors[rows] @ features.descriptors[columns].T, *limits)
             best[rows] = np.where(found < 0, -1, columns[found])

@@ -229,9 +229,8 @@ def take_census(
     - is out of view, and one of the two has just gone out of view that are closer than `MapConfig.spacing` allows.
     """
     t, c, f = table, config, features
-    order = np.argsort(f.uv_left[:, 0], kind="stable")
     counts = t.seen, t.in_view, t.missed, t.last_seen, t.out_of_view, t.unseen
-    seen = np.ascontiguousarray(f.uv_left), f.descriptors, f.laplacian, order
+    seen = np.ascontiguousarray(f.uv_left), f.descriptors, f.laplacian, f.by_column
     inside = expected & rig.left.in_image(view.uv_left, c.view_margin)
     limits = c.occlusion_radius, c.same_distance, c.same_descriptor
     replaceable = bool(f.has_stereo.any() or not len(f))

@@ -9,7 +9,7 @@ and what waits for a depth, are then as they were; what is followed is not copie
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -66,10 +66,10 @@ class LandmarkTable(Table):
     patches: NDArray[np.object_] = _column(object, fill=None)  # `Patch` at first sight (N,), or None
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            if getattr(self, f.name) is None:
-                dtype, shape, fill = f.metadata["blank"]
-                object.__setattr__(self, f.name, np.full((len(self.ids), *shape), fill, dtype))
+        for name, column in list(vars(self).items()):
+            if column is None:
+                dtype, shape, fill = self.__dataclass_fields__[name].metadata["blank"]
+                object.__setattr__(self, name, np.full((len(self.ids), *shape), fill, dtype))
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({count(int((self.ids >= 0).sum()), 'landmark')}, {self.descriptors.shape[1]}-D)"
@@ -212,8 +212,8 @@ class Tracks(LandmarkTable):
 
     def count(self, rows: IndexArray) -> IdArray:
         """Number of measurements of tracks in the window (M,)."""
-        measured = self.dof.take(rows, axis=0) != 0
-        return np.asarray(measured @ np.ones(measured.shape[1], np.int64))  # `count_nonzero` takes half as long again
+        measured = (self.dof.take(rows, axis=0) != 0).astype(np.float32)
+        return (measured @ np.ones(measured.shape[1], np.float32)).astype(np.int64)  # a sum takes thrice as long
 
     def set_features(self, rows: IndexArray, features: IndexArray) -> None:
         """Rows (K,) are found as these features, in place; of rows alike to the bit, the first has the feature."""

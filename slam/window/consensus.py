@@ -6,12 +6,13 @@ It tells which matches agree with one rigid motion before any estimator sees the
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from slam.chi_square import chi_square_limit
 from slam.geometry import kernels
-from slam.geometry.arrays import BoolArray, IndexArray, median
+from slam.geometry.arrays import BoolArray, IndexArray, changed, median
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import Array, inverse, pose
 from slam.window.gating import MIN_CONSENSUS
@@ -84,6 +85,13 @@ class _Matches:
     z: Array  # (M, 3), see `RectifiedStereo.measure`
     threshold: float  # largest error of an inlier [px]
 
+    @cached_property
+    def window(self) -> Window:
+        """One pose, and all matches."""
+        n = len(self.points)
+        rows = Rows.of(0, np.arange(n), self.z, 1.0)
+        return Window(self.stereo, np.eye(4)[None], self.points, rows, known=np.ones(n, bool))
+
     def errors(self, poses: Array) -> Array:
         """Largest error of uL, vL, uR (H, M) [px] of each match under each pose; NaN behind the camera."""
         return np.asarray(kernels.errors(self.stereo.intrinsics, self.points, self.z, poses))
@@ -97,12 +105,10 @@ class _Matches:
         rows = np.flatnonzero(mask)
         if len(rows) > _ENOUGH:
             rows = rows[np.linspace(0, len(rows) - 1, _ENOUGH).astype(int)]
-        known = np.ones(len(rows), bool)
-        w = Window(
-            self.stereo, T[None], self.points[rows], Rows.of(0, np.arange(len(rows)), self.z[rows], 1.0), known=known
-        )
+        w, root = self.window, np.zeros((len(mask), 3, 3))
+        root[rows] = np.eye(3)
         try:
-            return solve(w, steps=steps).window.poses[0]
+            return solve(w.at(T[None], w.points, changed(w.rows, root=root)), steps=steps).window.poses[0]
         except np.linalg.LinAlgError:
             return T
 

@@ -211,21 +211,6 @@ def gauss_newton(camera, poses, points, layout, knowledge, centre, n, huber, clo
 
 
 @kernel
-def by_point(point, count):
-    """Rows by point: those of point p are ``order[first[p]:first[p + 1]]``."""
-    first, order, at = np.zeros(count + 1, np.int64), np.empty(len(point), np.int64), np.empty(count, np.int64)
-    for m in range(len(point)):
-        first[point[m] + 1] += 1
-    for p in range(count):
-        at[p] = first[p]
-        first[p + 1] += first[p]
-    for m in range(len(point)):
-        order[at[point[m]]] = m
-        at[point[m]] += 1
-    return first, order
-
-
-@kernel
 def row_distances(camera, poses, points, rows):
     """Square of each whitened residual (M,), ∞ for a row that does not count, without a left pixel, or behind."""
     pose, point, z, root = rows

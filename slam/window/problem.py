@@ -10,10 +10,10 @@ import numpy as np
 
 from slam.geometry.arrays import Array, BoolArray, IndexArray, Table
 from slam.window import chart_kernels, terms
-from slam.window.kernels import by_point
 from slam.window.stereo import RectifiedStereo
 
 KNOWN, ELIMINATED = terms.KNOWN, terms.ELIMINATED
+_ANY = np.zeros(0, bool)  # fixed: a mask that is not given
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,9 @@ class Rows(Table):
     def of(cls, pose: IndexArray | int, point: IndexArray, z: Array, sigma: float) -> Rows:
         """Measurements with independent noise of each pixel, `sigma` [px], from one pose or from poses (M,)."""
         n = len(point)
-        return cls(np.full(n, pose), point, z, np.repeat((np.eye(3) / sigma)[None], n, axis=0))
+        root = np.zeros((n, 3, 3))
+        root[:] = np.eye(3) / sigma
+        return cls(np.full(n, pose), point, z, root)
 
     @classmethod
     @cache
@@ -205,23 +207,13 @@ class Window:
             asked = self.asked[members]
             order, skipped = np.argsort(asked, kind="stable"), len(asked) - int(np.count_nonzero(asked))
             members, basis = members[order], basis[order]
-        place = np.full(len(self.points), ELIMINATED)
-        if self.known is not None:
-            place[self.known] = KNOWN
-        place[members] = np.arange(len(members))
-        at, free = 3 * len(members), len(self.poses)
-        column = at + 6 * np.arange(free)
-        if self.free is not None:
-            free = int(np.count_nonzero(self.free))
-            column = np.where(self.free, at + 6 * np.cumsum(self.free) - 6, -1)
-        of_points = 3 * place[prior.points][:, None] + np.arange(3)
-        of_poses = at + np.arange(6 * len(prior.relative))
-        rows, places = self.rows, self.places
-        first, order = by_point(np.concatenate([rows.point, places.point]), len(place))
-        return Layout(
-            column, place, basis, np.concatenate([of_points.ravel(), of_poses]),
-            np.concatenate([rows.pose, places.pose]), first, order, at, 3 * skipped, free,
+        known, free = (_ANY if mask is None else mask for mask in (self.known, self.free))
+        column, place, to, pose_of, first, order, n = terms.arranged(
+            len(self.poses), free, len(self.points), known, members, prior.points, len(prior.relative),
+            self.rows.arrays[:2], self.places.arrays[:2],
         )  # fmt: skip
+        at = 3 * len(members)
+        return Layout(column, place, basis, to, pose_of, first, order, at, 3 * skipped, (n - at) // 6)
 
     @property
     def knowledge(self) -> tuple[Any, ...]:

@@ -1,4 +1,4 @@
-"""What is added to a window's normal equations: the prior, measurements, and what else is known of points.
+"""How a window's unknowns stand, and what is added to its equations: prior, measurements, what is known of points.
 
 The arrays are those of `slam.window.kernels`.
 """
@@ -11,13 +11,50 @@ from slam.kernels.linear import multiply, row_times, subtract
 from slam.kernels.se3 import adjoint, between, compose, log, transform_back
 from slam.kernels.stereo import by_pose, residual
 from slam.kernels.velocities import add_velocity_rows, velocity_change
-from slam.runtime.compilation import helper
+from slam.runtime.compilation import helper, kernel
 from slam.window.chart_kernels import chart
 
 #: fixed: what a point is to the solver, known exactly or eliminated. Others: its place among the prior's.
 KNOWN, ELIMINATED = -2, -1
 
 _BEHIND = 100.0  # numerics: whitened residual of a point that is behind its camera
+
+
+@kernel
+def arranged(poses, free, count, known, members, of_prior, relative, rows, places):
+    """Where unknowns of `poses` and of `count` points stand, as `slam.window.problem.Layout` says, and their number.
+
+    `free` (K,) and `known` (N,) are masks, without rows for all and none; `members` are points that are unknowns, in
+    their order, those `of_prior` among them; the prior is of as many poses as `relative`. `rows` and `places` name
+    their poses and points.
+    """
+    column, place, of_rows = np.full(poses, -1), np.full(count, ELIMINATED), len(rows[0])
+    pose_of, point = np.empty(of_rows + len(places[0]), np.int64), np.empty(of_rows + len(places[0]), np.int64)
+    for p in range(len(known)):
+        if known[p]:
+            place[p] = KNOWN
+    for d in range(len(members)):
+        place[members[d]] = d
+    n, to = 3 * len(members), np.empty(3 * len(of_prior) + 6 * relative, np.int64)
+    for i in range(len(to)):
+        d = i - 3 * len(of_prior)
+        to[i] = n + d if d >= 0 else 3 * place[of_prior[i // 3]] + i % 3
+    for k in range(poses):
+        if len(free) == 0 or free[k]:
+            column[k] = n
+            n += 6
+    first, order, at = np.zeros(count + 1, np.int64), np.empty(len(point), np.int64), np.empty(count, np.int64)
+    for m in range(len(point)):
+        part, row = (rows, m) if m < of_rows else (places, m - of_rows)
+        pose_of[m], point[m] = part[0][row], part[1][row]
+        first[point[m] + 1] += 1
+    for p in range(count):
+        at[p] = first[p]
+        first[p + 1] += first[p]
+    for m in range(len(point)):
+        order[at[point[m]]] = m
+        at[point[m]] += 1
+    return column, place, to, pose_of, first, order, n
 
 
 @helper

@@ -139,8 +139,9 @@ def test_what_is_derived_of_the_last_poses_is_what_the_filter_knows():
     data = scene(path(25, 0.1, 0.4 * FORWARD, 0.1 * YAW), points=900, sigma=models.pixel_sigma, limit=40)
     backend = EkfBackend(RIG, models)
     for stamp, _, seen in data:
-        used = step(backend, stamp, seen, known).used
-        pose = OnlinePose.seen(RIG, models.pixel_sigma, backend.estimate(False), seen.select(np.isin(seen.ids, used)))
+        used = np.isin(seen.ids, step(backend, stamp, seen, known).used)
+        pixels = seen.uv_left[used], seen.uv_right[used]
+        pose = OnlinePose.seen(RIG, models.pixel_sigma, backend.estimate(False), *pixels)
         online = [*online[-4:], pose]
         told, derived = backend.recent(5), derived_recent(online)
         J = np.concatenate([-se3.adjoint(se3.inverse(told.poses[-1]) @ told.poses[0]), np.eye(6)], axis=1)
