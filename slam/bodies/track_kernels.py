@@ -202,6 +202,18 @@ def _mean(points, A, mean):
         mean[i] = row_times(P, i, told)
 
 
+@helper
+def _window_in_body(A, p, anchor, T, there, point, turned):
+    """One measurement's point (3,) and information (3, 3), none where it is not `there`, in a body's axes T."""
+    away = p[0] + anchor[0] - T[0, 3], p[1] + anchor[1] - T[1, 3], p[2] + anchor[2] - T[2, 3]
+    for i in range(3):
+        point[i] = row_times(T.T, i, away)
+    if there:
+        turn(T.T, A, turned)
+    else:
+        turned[:] = 0.0
+
+
 @kernel
 def windows_in_body(A, p, dof, anchor, rows, history, known):
     """What tracks measured, in the coordinates of a body with poses `history` (W, 4, 4) at the slots `known` (W,).
@@ -214,15 +226,8 @@ def windows_in_body(A, p, dof, anchor, rows, history, known):
     for m in range(len(rows)):
         n = rows[m]
         for w in range(size):
-            T, q, o = history[w], p[n, w], anchor[n]
-            away = q[0] + o[0] - T[0, 3], q[1] + o[1] - T[1, 3], q[2] + o[2] - T[2, 3]
-            for i in range(3):
-                points[m, w, i] = row_times(T.T, i, away)
             there[m, w] = known[w] and dof[n, w] > 0
-            if there[m, w]:
-                turn(T.T, A[n, w], turned[m, w])
-            else:
-                turned[m, w] = 0.0
+            _window_in_body(A[n, w], p[n, w], anchor[n], history[w], there[m, w], points[m, w], turned[m, w])
     return points, turned, there
 
 
@@ -236,15 +241,35 @@ def weighted_means(points, A):
 
 
 @kernel
-def squares(points, A):
-    """χ² (M,) of "one fixed point" for points by slot (M, W, 3) with information (M, W, 3, 3)."""
-    out, mean = np.zeros(len(points)), np.empty(3)
-    for m in range(len(points)):
-        p = points[m]
-        _mean(p, A[m], mean)
-        for w in range(len(p)):
-            out[m] += square(A[m, w], (p[w, 0] - mean[0], p[w, 1] - mean[1], p[w, 2] - mean[2]))
-    return out
+def membership_squares(A, p, dof, anchor, rows, history, known):
+    """χ² (M, 2) of "one fixed point" in a body with poses `history` (W, 4, 4) and in the world, over its slots.
+
+    These are the slots `known` (W,). And how many of them, and how many numbers in them, were measured (M, 2).
+    """
+    out, counts, size = np.zeros((len(rows), 2)), np.zeros((len(rows), 2), np.int64), A.shape[1]
+    points, turned, world, mean = np.empty((size, 3)), np.empty((size, 3, 3)), np.zeros((size, 3, 3)), np.empty(3)
+    for m in range(len(rows)):
+        n = rows[m]
+        for w in range(size):
+            there = known[w] and dof[n, w] > 0
+            _window_in_body(A[n, w], p[n, w], anchor[n], history[w], there, points[w], turned[w])
+            world[w] = 0.0
+            if there:
+                _add(world[w], A[n, w], 1.0)
+                counts[m, 0] += 1
+                counts[m, 1] += dof[n, w]
+        out[m, 0], out[m, 1] = _square(points, turned, mean), _square(p[n], world, mean)
+    return out, counts
+
+
+@helper
+def _square(points, A, mean):
+    """χ² of "one fixed point" for points by slot (W, 3) with information (W, 3, 3); the point is put into `mean`."""
+    total = 0.0
+    _mean(points, A, mean)
+    for w in range(len(points)):
+        total += square(A[w], (points[w, 0] - mean[0], points[w, 1] - mean[1], points[w, 2] - mean[2]))
+    return total
 
 
 @kernel
