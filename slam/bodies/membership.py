@@ -16,7 +16,7 @@ from slam.bodies.bodies import Body, hidden, in_body_axes, of_bodies, with_exten
 from slam.bodies.config import CLEAR, EXPLAINED, MIN_FRAMES, RUN, WINDOW
 from slam.bodies.fits import fit_positions, times_vectors
 from slam.bodies.frame import Frame
-from slam.bodies.track_kernels import LEAST, RIDGE, distances_from_box, inverses, membership_squares, weighted_means
+from slam.bodies.track_kernels import LEAST, distances_from_box, improve_members, membership_squares, weighted_means
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.arrays import changed
@@ -232,13 +232,9 @@ def _distances(body: Body, tracks: Tracks, rows: IndexArray, margin: float) -> A
 
 def _improve(body: Body, tracks: Tracks, slot: int) -> None:
     """Take this frame's measurements into the members' points, in place."""
-    t, R = tracks, body.T[:3, :3]
+    t = tracks
     mine = np.flatnonzero((t.body == body.id) & (t.misfit == 0) & (t.dof[:, slot] > 0))
-    gap = (t.p[mine, slot] + t.anchor[mine] - body.T[:3, 3]) @ R - t.local[mine]
-    turned = R.T @ t.A[mine, slot] @ R
-    total = t.local_information[mine] + turned
-    t.local_information[mine] = total
-    t.local[mine] += times_vectors(inverses(total, RIDGE, 0.0), times_vectors(turned, gap))
+    improve_members(body.T, t.A, t.p, t.anchor, mine, slot, t.local, t.local_information)
 
 
 def merge(bodies: dict[int, Body], tracks: Tracks) -> None:

@@ -26,6 +26,7 @@ from slam.bodies.bodies import Body
 from slam.bodies.config import MIN_POINTS
 from slam.bodies.finder import Displacements, Scene
 from slam.bodies.frame import Frame
+from slam.bodies.pose_kernels import way_over_scatter
 from slam.bodies.scene_kernels import MEDIAN, PRIOR
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, inverse, points_by_pose
@@ -133,10 +134,5 @@ def _by_frames(places: Array, times: Array) -> float:
     n = len(places)
     if n < MIN_POINTS:
         return 0.0
-    t = times - times.mean()
-    basis, _ = np.linalg.qr(np.stack([np.ones(n), t, t * t], axis=1))
-    offset = places - places.mean(axis=0)
-    squares = np.array([(offset[:, :k] ** 2).sum() for k in (1, len(_ENDS))])  # of the middle, and of all
-    ways = [((basis[:, 1:].T @ offset[:, :k].reshape(n, -1)) ** 2).sum() for k in (1, len(_ENDS))]
-    ratio = np.max(ways / (np.maximum(squares - ways, 0.0) + _WEAK))
+    ratio = way_over_scatter(places, times, _WEAK)
     return _evidence(2.0 * float(fdtrc(6, 3 * n - 9, ratio * (3 * n - 9) / 6.0)))

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import invert_symmetric, multiply, row_times, square, trace, turn
-from slam.kernels.se3 import transform, transform_back
+from slam.kernels.linear import assign, invert_symmetric, multiply, row_times, square, trace, turn
+from slam.kernels.se3 import point_by_motion, transform, transform_back
 from slam.kernels.stereo import by_point, residual
 from slam.runtime.compilation import disjoint_helper, helper, kernel
 
@@ -30,15 +30,6 @@ def _add(total, M, factor):
 def _add_times(total, M, v, factor):
     for i in range(3):
         total[i] += factor * row_times(M, i, v)
-
-
-@kernel
-def inverses(M, share, least):
-    """Inverses of symmetric matrices (N, 3, 3) with a `share` of the trace and `least` added to the diagonal."""
-    out = np.empty_like(M)
-    for n in range(len(M)):
-        invert_symmetric(M[n], share * trace(M[n]) + least, out[n])
-    return out
 
 
 @disjoint_helper
@@ -70,58 +61,97 @@ def _add_four(total, a, b, c, d, weight):
 
 
 @kernel
-def fit_fixed_points(A, p, anchor, rows, position, covariance):
-    """Fixed points that fit the windows best, and their covariances, into `position` (N, 3), `covariance` (N, 3, 3)."""
-    total, told = np.empty((3, 3)), np.empty(3)
+def fit_tracks(A, p, dof, anchor, rows, doubtful, least, times, prior, moves, position, covariance, velocity, spread):
+    """Fixed points that fit the windows best, in place; or points with an even velocity that is clear, above `moves`.
+
+    A velocity is sought for tracks that are `doubtful` (N,), have one already, or were measured less than `least`
+    times, but twice. See `constant_velocities`; `spread` (N, 3, 3) are the velocities' covariances.
+    """
+    total, told, at, own = np.empty((3, 3)), np.empty(3), np.empty((2, 3)), np.empty((2, 3, 3))
     for m in range(len(rows)):
         n = rows[m]
-        total[:], told[:] = 0.0, 0.0
+        total[:], told[:], count, had = 0.0, 0.0, 0, doubtful[n]
         for w in range(A.shape[1]):
             _add(total, A[n, w], 1.0)
             _add_times(told, A[n, w], p[n, w], 1.0)
+            count += dof[n, w] > 0
         invert_symmetric(total, RIDGE * trace(total) + LEAST, covariance[n])
         for i in range(3):
-            position[n, i] = anchor[n, i] + row_times(covariance[n], i, told)
+            had = had or velocity[n, i] != 0.0
+            position[n, i], velocity[n, i] = anchor[n, i] + row_times(covariance[n], i, told), 0.0
+        if count < 2 or not (had or count < least):
+            continue
+        if _constant_velocity(A[n], p[n], times, prior, at, own) > moves:
+            for i in range(3):
+                position[n, i], velocity[n, i] = anchor[n, i] + at[0, i], at[1, i]
+            assign(own[0], covariance[n])
+            assign(own[1], spread[n])
 
 
 @kernel
 def constant_velocities(A, p, rows, times, prior):
-    """Points (M, 3) at time 0 and even velocities (M, 3) [m/s] that fit the windows best, with their covariances.
+    """Points at time 0 and even velocities (M, 2, 3) [m], [m/s] that fit the windows best, covariances (M, 2, 3, 3).
 
     And χ²(3) of the velocities (M,). Slots have `times` (W,) [s]; `prior` is the information on each axis of the
     velocity before anything is known [s²/m²].
     """
     n = len(rows)
-    points, P, velocity, PV = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3, 3))
-    test = np.zeros(n)
-    M0, M1, M2 = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    P0, G, S = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    b0, b1, told = np.empty(3), np.empty(3), np.empty(3)
+    at, own, test = np.empty((n, 2, 3)), np.empty((n, 2, 3, 3)), np.empty(n)
     for m in range(n):
-        M0[:], M1[:], M2[:], b0[:], b1[:] = 0.0, 0.0, 0.0, 0.0, 0.0
-        for w in range(A.shape[1]):
-            t, Aw, pw = times[w], A[rows[m], w], p[rows[m], w]
-            _add(M0, Aw, 1.0)
-            _add(M1, Aw, t)
-            _add(M2, Aw, t * t)
-            _add_times(b0, Aw, pw, 1.0)
-            _add_times(b1, Aw, pw, t)
-        invert_symmetric(M0, RIDGE * trace(M0) + LEAST, P0)
-        multiply(P0, M1, G)
-        for i in range(3):
-            told[i] = b1[i] - row_times(G.T, i, b0)
-            for j in range(3):
-                S[i, j] = M2[i, j] - (G[0, i] * M1[0, j] + G[1, i] * M1[1, j] + G[2, i] * M1[2, j])
-            S[i, i] += prior
-        invert_symmetric(S, RIDGE * trace(S) + LEAST, PV[m])
-        for i in range(3):
-            velocity[m, i] = row_times(PV[m], i, told)
-            test[m] += velocity[m, i] * told[i]
-        turn(G, PV[m], P[m])
-        _add(P[m], P0, 1.0)
-        for i in range(3):
-            points[m, i] = row_times(P0, i, b0) - row_times(G, i, velocity[m])
-    return points, P, velocity, PV, test
+        test[m] = _constant_velocity(A[rows[m]], p[rows[m]], times, prior, at[m], own[m])
+    return at, own, test
+
+
+@helper
+def _constant_velocity(A, p, times, prior, at, own):
+    """See `constant_velocities`, of one window; returns χ²(3)."""
+    M0, M1, M2 = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    P0, G, S = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    b0, b1, told, test = np.zeros(3), np.zeros(3), np.empty(3), 0.0
+    for w in range(len(p)):
+        t = times[w]
+        _add(M0, A[w], 1.0)
+        _add(M1, A[w], t)
+        _add(M2, A[w], t * t)
+        _add_times(b0, A[w], p[w], 1.0)
+        _add_times(b1, A[w], p[w], t)
+    invert_symmetric(M0, RIDGE * trace(M0) + LEAST, P0)
+    multiply(P0, M1, G)
+    for i in range(3):
+        told[i] = b1[i] - row_times(G.T, i, b0)
+        for j in range(3):
+            S[i, j] = M2[i, j] - (G[0, i] * M1[0, j] + G[1, i] * M1[1, j] + G[2, i] * M1[2, j])
+        S[i, i] += prior
+    invert_symmetric(S, RIDGE * trace(S) + LEAST, own[1])
+    for i in range(3):
+        at[1, i] = row_times(own[1], i, told)
+        test += at[1, i] * told[i]
+    turn(G, own[1], own[0])
+    _add(own[0], P0, 1.0)
+    for i in range(3):
+        at[0, i] = row_times(P0, i, b0) - row_times(G, i, at[1])
+    return test
+
+
+@kernel
+def well_known(T_world_left, position, covariance, dof, rows, least, farthest):
+    """Those of the tracks measured `least` times whose depth is `farthest` times its deviation; x/z, y/z, log z (K, 3).
+
+    So they are seen from a pose (4, 4).
+    """
+    known, place, local, k = np.empty(len(rows), np.intp), np.empty((len(rows), 3)), np.empty(3), 0
+    for m in range(len(rows)):
+        n, count = rows[m], 0
+        for w in range(dof.shape[1]):
+            count += dof[n, w] > 0
+        variance = trace(covariance[n])
+        transform_back(T_world_left, position[n], local)
+        if count < least or variance < 0.0 or not local[2] > farthest * np.sqrt(variance):  # below 0 by rounding alone
+            continue
+        depth = max(local[2], 1e-9)
+        known[k], place[k, 0], place[k, 1], place[k, 2] = n, local[0] / depth, local[1] / depth, np.log(depth)
+        k += 1
+    return known[:k].copy(), place[:k].copy()
 
 
 @kernel
@@ -273,6 +303,43 @@ def _square(points, A, mean):
 
 
 @kernel
+def place_members(T, P, local, information, rows, least, position, covariance):
+    """Positions and covariances in the world, in place, of tracks at `local` (N, 3) in a body at T, its covariance P.
+
+    Their points have `information` (N, 3, 3) in its axes, and `least` more.
+    """
+    spread, J, v = np.empty((3, 3)), np.empty((3, 6)), np.empty(6)
+    for m in range(len(rows)):
+        n = rows[m]
+        transform(T, local[n], position[n])
+        invert_symmetric(information[n], least, spread)
+        point_by_motion(local[n], 1.0, J)
+        for i in range(3):
+            for k in range(6):
+                v[k] = row_times(P, k, J[i]) + P[k, 3 + i]
+            for j in range(3):
+                spread[i, j] += row_times(J, j, v) + v[3 + j]
+        turn(T, spread, covariance[n])
+
+
+@kernel
+def improve_members(T, A, p, anchor, rows, slot, local, information):
+    """Take the measurements of a slot into the points of a body at T and their information (N, 3, 3), in place."""
+    turned, P, gap, told = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    for m in range(len(rows)):
+        n = rows[m]
+        _window_in_body(A[n, slot], p[n, slot], anchor[n], T, True, gap, turned)
+        _add(information[n], turned, 1.0)
+        invert_symmetric(information[n], RIDGE * trace(information[n]), P)
+        for i in range(3):
+            gap[i] -= local[n, i]
+        for i in range(3):
+            told[i] = row_times(turned, i, gap)
+        for i in range(3):
+            local[n, i] += row_times(P, i, told)
+
+
+@kernel
 def distances_from_box(T, lower, upper, position, covariance, rows):
     """Squared distances (M,), in their own noise, of tracks from the box between two corners in a body's axes T."""
     out, local, away, gap, P = np.empty(len(rows)), np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
@@ -291,10 +358,14 @@ def distances_from_box(T, lower, upper, position, covariance, rows):
 
 
 @kernel
-def expected_pixels(camera, T_world_left, position, covariance, rows, sigma):
-    """Pixels (M, 3) at which tracks are expected, NaN behind the camera, and their innovation covariances (M, 3, 3)."""
+def expected_pixels(camera, T_world_left, position, covariance, dof, rows, sigma, sigmas, least, reach):
+    """Pixels (M, 3) at which tracks are expected, NaN behind the camera, and their innovation covariances (M, 3, 3).
+
+    And by how much the right pixel may be off (M,): by so many `sigmas`, and by the first `reach` over the depth [px m]
+    for tracks measured in less than the `least` frames, by the second for others.
+    """
     n = len(rows)
-    z, S, none = np.empty((n, 3)), np.empty((n, 3, 3)), np.zeros(3)
+    z, S, none, allowance = np.empty((n, 3)), np.empty((n, 3, 3)), np.zeros(3), np.empty(n)
     local, J, G = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for m in range(n):
         transform_back(T_world_left, position[rows[m]], local)
@@ -303,43 +374,48 @@ def expected_pixels(camera, T_world_left, position, covariance, rows, sigma):
             z[m, i] = -z[m, i]
             by_point(J[i], T_world_left, G[i])
         turn(G, covariance[rows[m]], S[m])
+        count = 0
+        for w in range(dof.shape[1]):
+            count += dof[rows[m], w] > 0
         for i in range(3):
             S[m, i, i] += sigma * sigma
-    return z, S
+        deviation = np.sqrt(max(S[m, 2, 2], sigma * sigma))  # rounding may leave a covariance that is not definite
+        allowance[m] = sigmas * deviation + (reach[0] if count < least else reach[1]) / max(local[2], 1e-3)
+    return z, S, allowance
 
 
 @kernel
-def points_on_rays(camera, T_world_left, points, measured, sigma, far, steps):
-    """Points (N, 3) on the measured rays, their information (N, 3, 3), and numbers measured (N,).
+def measure(camera, T_world_left, position, anchor, measured, rows, slot, sigma, far, steps, A, p, dof):
+    """Enter what tracks measured (M, 3) into a slot of their windows, in place: see `slam.bodies.fits.record`.
 
-    See `slam.bodies.fits.measure`; `camera` (7,) is `slam.geometry.rig.StereoRig.rectified_parameters`, `far`
-    [px] how far off an expected point may be, and `steps` how often it is linearised at most.
+    `camera` (7,) is `slam.geometry.rig.StereoRig.rectified_parameters`, `far` [px] how far off an expected point may
+    be, and `steps` how often it is linearised at most.
     """
     fu, fv, u0, v0, right_fu, _, shift = camera
-    out, A, dof = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3)), np.zeros(len(points), np.int8)
     place, r, J, g = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
-    for n in range(len(points)):
-        x, y = (measured[n, 0] - u0) / fu, (measured[n, 1] - v0) / fv
-        transform_back(T_world_left, points[n], place)
-        met, stereo, front = place[2], not np.isnan(measured[n, 2]), False
+    for m in range(len(rows)):
+        n, z = rows[m], measured[m]
+        x, y = (z[0] - u0) / fu, (z[1] - v0) / fv
+        transform_back(T_world_left, position[n], place)
+        met, stereo, front = place[2], not np.isnan(z[2]), False
         for _ in range(steps):
             depth = met
             place[0], place[1], place[2] = x * depth, y * depth, depth
-            front = residual(camera, place, measured[n], r, J) and r[0] + r[1] == r[0] + r[1]
+            front = residual(camera, place, z, r, J) and r[0] + r[1] == r[0] + r[1]
             if not (front and stereo):
                 break
             met = depth - r[2] * depth * depth / (right_fu * shift)  # on the ray uR changes by f' b / z
             if abs(r[2]) <= far:
                 break
-        if not front:
-            transform(T_world_left, np.zeros(3), out[n])
-            continue
-        place[0], place[1], place[2] = x * met, y * met, met
-        transform(T_world_left, place, out[n])
-        dof[n] = 3 if stereo else 2
-        for k in range(dof[n]):
+        scale = met if front else 0.0
+        place[0], place[1], place[2] = x * scale, y * scale, scale
+        transform(T_world_left, place, p[n, slot])
+        dof[n, slot] = (3 if stereo else 2) if front else 0
+        A[n, slot] = 0.0
+        for i in range(3):
+            p[n, slot, i] -= anchor[n, i]
+        for k in range(dof[n, slot]):
             by_point(J[k], T_world_left, g)
             for i in range(3):
                 for j in range(3):
-                    A[n, i, j] += g[i] * g[j] / (sigma * sigma)
-    return out, A, dof
+                    A[n, slot, i, j] += g[i] * g[j] / (sigma * sigma)
