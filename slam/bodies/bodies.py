@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.bodies.belief import EVEN, BodyBelief, when_measured, when_missed
+from slam.bodies.body_kernels import windows_in_body
 from slam.bodies.config import CLEAR, MIN_FRAMES
-from slam.bodies.track_kernels import windows_in_body
 from slam.data import BoolArray
 from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, so3_exp, transform, twice

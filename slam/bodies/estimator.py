@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.bodies.belief import BodyBelief, Points, begun, carried, compact, slid, window
+from slam.bodies.body_kernels import motion_in_world, predicted_camera
 from slam.bodies.config import MIN_POINTS, RUN
-from slam.bodies.pose_kernels import body_in_world, predicted_camera
 from slam.chi_square import chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, RecentPoses
 from slam.geometry.arrays import changed, isin
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig, measurement_rows
-from slam.geometry.se3 import Array, inverse, log, transform
+from slam.geometry.se3 import Array, adjoint, inverse, log, transform
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.window import pose_only
@@ -136,17 +136,17 @@ class BodyEstimator:
     def _expected(self, b: BodyBelief, cameras: RecentPoses) -> _Expected:
         """With the new frame's pose as the motion model predicts it."""
         dt = float(cameras.stamps[-1] - cameras.stamps[-2])
-        variance = np.repeat(self.models.velocity_variance(dt)[::-1], 3)
         velocity, spread = b.estimate.velocity, b.estimate.velocity_covariance
-        Y, covariance, impulse, local = predicted_camera(
-            b.poses[-1], cameras.poses[-2:], velocity, spread, variance, dt, b.points.local
-        )
-        covariance += relative_covariance(cameras.covariance[-12:, -12:], cameras.poses[-2], cameras.poses[-1])
+        Y, by_impulse, by_velocity = predicted_camera(b.poses[-1], cameras.poses[-2:], velocity, dt)
+        turn = Y[:3, :3].T @ b.poses[-1][:3, :3]
         b = changed(
             b, stamps=cameras.stamps, poses=np.concatenate([b.poses, Y[None]]), scales=np.append(b.scales, 1.0),
             points=changed(b.points, unseen=b.points.unseen + 1),
         )  # fmt: skip
-        return _Expected(b, covariance, impulse, local)
+        impulse = by_impulse * np.repeat(self.models.velocity_variance(dt)[::-1], 3) @ by_impulse.T
+        covariance = by_velocity @ spread @ by_velocity.T + impulse
+        covariance += relative_covariance(cameras.covariance[-12:, -12:], cameras.poses[-2], cameras.poses[-1])
+        return _Expected(b, covariance, impulse, turn @ b.points.local @ turn.T)
 
     def _predicted(self, b: BodyBelief, cameras: RecentPoses) -> BodyBelief:
         """With the covariances of a frame in which nothing was measured."""
@@ -245,13 +245,19 @@ class BodyEstimator:
         self, b: BodyBelief, id: int, cameras: RecentPoses, measured: bool, used: IdArray, rejected: IdArray
     ) -> BodyBelief:
         """With the estimate of its newest frame, where the camera's uncertainty is part of all that is in the world."""
-        k = 6 * min(len(b), 2)
-        P, dt = b.covariance[-k:, -k:] + cameras.covariance[-k:, -k:], float(b.stamps[-1] - b.stamps[-k // 6])
-        T, covariance, velocity, spread = body_in_world(
-            cameras.poses[-k // 6 :], b.poses[-2:], P, dt, b.velocity, np.diag(b.sigmas**2)
-        )
+        X, Y, velocity, spread = cameras.poses[-2:], b.poses[-2:], b.velocity, np.diag(b.sigmas**2)
+        k = 6 * len(Y)
+        A = np.zeros((k, k))
+        for i, own in enumerate(adjoint(Y)):
+            A[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = own
+        P = A @ (b.covariance[-k:, -k:] + cameras.covariance[-k:, -k:]) @ A.T  # of the body's poses
+        if len(b) > 1:
+            T, velocity, J = motion_in_world(X, Y, float(b.stamps[-1] - b.stamps[-2]))
+            spread = J @ P @ J.T
+        else:
+            T = X[-1:] @ inverse(Y)
         estimate = ObjectEstimate(
-            id, float(b.stamps[-1]), T, covariance, velocity, spread, measured, used, rejected
+            id, float(b.stamps[-1]), T[-1], P[-6:, -6:], velocity, spread, measured, used, rejected
         )  # fmt: skip
         if not all(np.isfinite(a).all() for a in (estimate.T_world_object, estimate.covariance, velocity, spread)):
             raise np.linalg.LinAlgError("a body's estimate is not finite")

@@ -10,7 +10,7 @@ import numpy as np
 from slam.bodies.bodies import Body
 from slam.bodies.config import MIN_FRAMES
 from slam.bodies.frame import Frame, Setup
-from slam.bodies.track_kernels import constant_velocities, fit_tracks, measure
+from slam.bodies.track_kernels import fit_tracks, measure
 from slam.data import BoolArray, IndexArray
 from slam.geometry.rig import StereoRig, measurement_rows
 from slam.geometry.se3 import Array
@@ -55,14 +55,10 @@ def fit(tracks: Tracks, rows: IndexArray, times: Array, max_speed: float) -> Non
     _fit(tracks, rows, tracks.doubtful, MIN_FRAMES, times, max_speed**-2)
 
 
-def _fit(
-    tracks: Tracks, rows: IndexArray, doubtful: BoolArray, least: int, times: Array, prior: float
-) -> None:  # fmt: skip
+def _fit(tracks: Tracks, rows: IndexArray, asked: BoolArray, least: int, times: Array, prior: float) -> None:
     t = tracks
-    fit_tracks(
-        t.A, t.p, t.dof, t.anchor, rows, doubtful, least, times, prior, MOVES, t.position, t.covariance, t.velocity,
-        t.velocity_covariance,
-    )  # fmt: skip
+    into = t.position, t.covariance, t.velocity, t.velocity_covariance
+    fit_tracks(t.A, t.p, t.dof, t.anchor, rows, asked, least, times, prior, MOVES, *into)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +77,11 @@ def constant_velocity(tracks: Tracks, rows: IndexArray, times: Array, max_speed:
 
     `max_speed` is the deviation of velocities before anything is known [m/s].
     """
-    at, own, test = constant_velocities(tracks.A, tracks.p, rows, times, max_speed**-2)
-    return ConstantVelocity(tracks.anchor[rows] + at[:, 0], own[:, 0], at[:, 1], own[:, 1], test)
+    t, n = tracks, len(tracks)
+    (position, velocity), (P, V), every = np.zeros((2, n, 3)), np.zeros((2, n, 3, 3)), np.ones(n, bool)
+    into = position, P, velocity, V
+    test = fit_tracks(t.A, t.p, t.dof, t.anchor, rows, every, 0, times, max_speed**-2, -np.inf, *into)
+    return ConstantVelocity(position[rows], P[rows], velocity[rows], V[rows], test)
 
 
 def times_vectors(M: Array, v: Array) -> Array:

@@ -8,10 +8,11 @@ import numpy as np
 
 from slam.bodies.belief import BodyBelief
 from slam.bodies.bodies import Body, of_bodies
+from slam.bodies.body_kernels import place_members
 from slam.bodies.config import MIN_FRAMES, MIN_POINTS
 from slam.bodies.estimator import BodyEstimator
 from slam.bodies.frame import Frame
-from slam.bodies.track_kernels import expected_pixels, place_members
+from slam.bodies.track_kernels import expected_pixels
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among, isin

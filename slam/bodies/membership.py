@@ -13,10 +13,11 @@ from functools import cache
 import numpy as np
 
 from slam.bodies.bodies import Body, hidden, in_body_axes, of_bodies, with_extent
+from slam.bodies.body_kernels import distances_from_box, improve_members, membership_squares, weighted_means
 from slam.bodies.config import CLEAR, EXPLAINED, MIN_FRAMES, RUN, WINDOW
 from slam.bodies.fits import fit_positions, times_vectors
 from slam.bodies.frame import Frame
-from slam.bodies.track_kernels import LEAST, distances_from_box, improve_members, membership_squares, weighted_means
+from slam.bodies.track_kernels import LEAST
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.arrays import changed

@@ -26,7 +26,6 @@ from slam.bodies.bodies import Body
 from slam.bodies.config import MIN_POINTS
 from slam.bodies.finder import Displacements, Scene
 from slam.bodies.frame import Frame
-from slam.bodies.pose_kernels import way_over_scatter
 from slam.bodies.scene_kernels import MEDIAN, PRIOR
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, inverse, points_by_pose
@@ -134,5 +133,12 @@ def _by_frames(places: Array, times: Array) -> float:
     n = len(places)
     if n < MIN_POINTS:
         return 0.0
-    ratio = way_over_scatter(places, times, _WEAK)
+    t = times - times.mean()
+    bend = t * t - (t @ t) / n
+    bend -= t * ((bend @ t) / (t @ t))
+    basis = np.array([t / np.sqrt(t @ t), bend / np.sqrt(bend @ bend)])
+    offset = (places - places.mean(axis=0)).reshape(n, -1)
+    ways, squares = np.square(basis @ offset).sum(axis=0), np.square(offset).sum(axis=0)  # of the middle first
+    both = ((float(ways[:k].sum()), float(squares[:k].sum())) for k in (3, len(ways)))
+    ratio = max(way / (max(every - way, 0.0) + _WEAK) for way, every in both)
     return _evidence(2.0 * float(fdtrc(6, 3 * n - 9, ratio * (3 * n - 9) / 6.0)))

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import assign, invert_symmetric, multiply, row_times, square, trace, turn
-from slam.kernels.se3 import point_by_motion, transform, transform_back
+from slam.kernels.linear import assign, invert_symmetric, multiply, row_times, trace, turn
+from slam.kernels.se3 import transform, transform_back
 from slam.kernels.stereo import by_point, residual
 from slam.runtime.compilation import disjoint_helper, helper, kernel
 
@@ -20,14 +20,16 @@ LEAST = 1e-12  #: numerics: and this for windows that are empty
 
 
 @helper
-def _add(total, M, factor):
+def add(total, M, factor):
+    """Add a factor times M (3, 3)."""
     for i in range(3):
         for j in range(3):
             total[i, j] += factor * M[i, j]
 
 
 @helper
-def _add_times(total, M, v, factor):
+def add_times(total, M, v, factor):
+    """Add a factor times ``M v`` (3,)."""
     for i in range(3):
         total[i] += factor * row_times(M, i, v)
 
@@ -60,76 +62,71 @@ def _add_four(total, a, b, c, d, weight):
 # ---------------------------------------------------------------------------------------------- windows of tracks
 
 
-@kernel
-def fit_tracks(A, p, dof, anchor, rows, doubtful, least, times, prior, moves, position, covariance, velocity, spread):
-    """Fixed points that fit the windows best, in place; or points with an even velocity that is clear, above `moves`.
+@helper
+def _count(dof):
+    """In how many slots (W,) something was measured."""
+    count = 0
+    for w in range(len(dof)):
+        count += dof[w] > 0
+    return count
 
-    A velocity is sought for tracks that are `doubtful` (N,), have one already, or were measured less than `least`
-    times, but twice. See `constant_velocities`; `spread` (N, 3, 3) are the velocities' covariances.
+
+@kernel
+def fit_tracks(A, p, dof, anchor, rows, asked, least, times, prior, moves, position, covariance, velocity, spread):
+    """Fixed points that fit the windows best, in place; or points with an even velocity, where its χ² is above `moves`.
+
+    A velocity is sought for tracks that are `asked` for (N,), have one already, or were measured less than `least`
+    times, but twice. Slots have `times` (W,) less the present [s], to which positions refer; `prior` is the information
+    on each axis of the velocity before anything is known [s²/m²]; `spread` (N, 3, 3) are the velocities' covariances.
+    Returns χ²(3) of the velocities (M,), 0 where none was sought.
     """
-    total, told, at, own = np.empty((3, 3)), np.empty(3), np.empty((2, 3)), np.empty((2, 3, 3))
+    test, even, M2, S, G = np.zeros(len(rows)), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    M0, M1, P, b0, b1, told = (
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty(3),
+        np.empty(3),
+        np.empty(3),
+    )
     for m in range(len(rows)):
         n = rows[m]
-        total[:], told[:], count, had = 0.0, 0.0, 0, doubtful[n]
-        for w in range(A.shape[1]):
-            _add(total, A[n, w], 1.0)
-            _add_times(told, A[n, w], p[n, w], 1.0)
-            count += dof[n, w] > 0
-        invert_symmetric(total, RIDGE * trace(total) + LEAST, covariance[n])
+        M0[:], M1[:], M2[:], b0[:], b1[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+        count, had = _count(dof[n]), asked[n]
         for i in range(3):
             had = had or velocity[n, i] != 0.0
-            position[n, i], velocity[n, i] = anchor[n, i] + row_times(covariance[n], i, told), 0.0
-        if count < 2 or not (had or count < least):
+            velocity[n, i] = 0.0
+        had = count > 1 and (had or count < least)
+        for w in range(A.shape[1]):
+            t, Aw, pw = times[w], A[n, w], p[n, w]
+            add(M0, Aw, 1.0)
+            add_times(b0, Aw, pw, 1.0)
+            if had:
+                add(M1, Aw, t)
+                add(M2, Aw, t * t)
+                add_times(b1, Aw, pw, t)
+        invert_symmetric(M0, RIDGE * trace(M0) + LEAST, covariance[n])
+        for i in range(3):
+            position[n, i] = anchor[n, i] + row_times(covariance[n], i, b0)
+        if not had:
             continue
-        if _constant_velocity(A[n], p[n], times, prior, at, own) > moves:
+        multiply(covariance[n], M1, G)
+        for i in range(3):
+            told[i] = b1[i] - row_times(G.T, i, b0)
+            for j in range(3):
+                S[i, j] = M2[i, j] - (G[0, i] * M1[0, j] + G[1, i] * M1[1, j] + G[2, i] * M1[2, j])
+            S[i, i] += prior
+        invert_symmetric(S, RIDGE * trace(S) + LEAST, P)
+        for i in range(3):
+            even[i] = row_times(P, i, told)
+            test[m] += even[i] * told[i]
+        if test[m] > moves:
+            turn(G, P, S)
+            add(covariance[n], S, 1.0)
+            assign(P, spread[n])
             for i in range(3):
-                position[n, i], velocity[n, i] = anchor[n, i] + at[0, i], at[1, i]
-            assign(own[0], covariance[n])
-            assign(own[1], spread[n])
-
-
-@kernel
-def constant_velocities(A, p, rows, times, prior):
-    """Points at time 0 and even velocities (M, 2, 3) [m], [m/s] that fit the windows best, covariances (M, 2, 3, 3).
-
-    And χ²(3) of the velocities (M,). Slots have `times` (W,) [s]; `prior` is the information on each axis of the
-    velocity before anything is known [s²/m²].
-    """
-    n = len(rows)
-    at, own, test = np.empty((n, 2, 3)), np.empty((n, 2, 3, 3)), np.empty(n)
-    for m in range(n):
-        test[m] = _constant_velocity(A[rows[m]], p[rows[m]], times, prior, at[m], own[m])
-    return at, own, test
-
-
-@helper
-def _constant_velocity(A, p, times, prior, at, own):
-    """See `constant_velocities`, of one window; returns χ²(3)."""
-    M0, M1, M2 = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
-    P0, G, S = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    b0, b1, told, test = np.zeros(3), np.zeros(3), np.empty(3), 0.0
-    for w in range(len(p)):
-        t = times[w]
-        _add(M0, A[w], 1.0)
-        _add(M1, A[w], t)
-        _add(M2, A[w], t * t)
-        _add_times(b0, A[w], p[w], 1.0)
-        _add_times(b1, A[w], p[w], t)
-    invert_symmetric(M0, RIDGE * trace(M0) + LEAST, P0)
-    multiply(P0, M1, G)
-    for i in range(3):
-        told[i] = b1[i] - row_times(G.T, i, b0)
-        for j in range(3):
-            S[i, j] = M2[i, j] - (G[0, i] * M1[0, j] + G[1, i] * M1[1, j] + G[2, i] * M1[2, j])
-        S[i, i] += prior
-    invert_symmetric(S, RIDGE * trace(S) + LEAST, own[1])
-    for i in range(3):
-        at[1, i] = row_times(own[1], i, told)
-        test += at[1, i] * told[i]
-    turn(G, own[1], own[0])
-    _add(own[0], P0, 1.0)
-    for i in range(3):
-        at[0, i] = row_times(P0, i, b0) - row_times(G, i, at[1])
+                velocity[n, i] = even[i]
+                position[n, i] -= row_times(G, i, even)
     return test
 
 
@@ -141,17 +138,17 @@ def well_known(T_world_left, position, covariance, dof, rows, least, farthest):
     """
     known, place, local, k = np.empty(len(rows), np.intp), np.empty((len(rows), 3)), np.empty(3), 0
     for m in range(len(rows)):
-        n, count = rows[m], 0
-        for w in range(dof.shape[1]):
-            count += dof[n, w] > 0
+        n = rows[m]
         variance = trace(covariance[n])
         transform_back(T_world_left, position[n], local)
-        if count < least or variance < 0.0 or not local[2] > farthest * np.sqrt(variance):  # below 0 by rounding alone
+        if (
+            _count(dof[n]) < least or variance < 0.0 or not local[2] > farthest * np.sqrt(variance)
+        ):  # below 0 by rounding alone
             continue
         depth = max(local[2], 1e-9)
         known[k], place[k, 0], place[k, 1], place[k, 2] = n, local[0] / depth, local[1] / depth, np.log(depth)
         k += 1
-    return known[:k].copy(), place[:k].copy()
+    return known[:k], place[:k]
 
 
 @kernel
@@ -163,41 +160,37 @@ def displaced(A, p, dof, rows, ages, most_recent, rays, centres, slide):
     which it is seen otherwise [rad]. Displacements (M, 3), their information (M, 3, 3), and lags (M,) [frames].
     """
     d, W, lag = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3)), np.empty(len(rows))
-    now, before, P_now, P_before = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    b_now, b_before = np.empty(3), np.empty(3)
+    total, P, told, age, slots = (
+        np.empty((2, 3, 3)),
+        np.empty((2, 3, 3)),
+        np.empty((2, 3)),
+        np.empty(2),
+        np.empty(2, np.intp),
+    )
     for m in range(len(rows)):
         n = rows[m]
-        count = 0
-        for w in range(A.shape[1]):
-            count += dof[n, w] > 0
-        recent = min(max(count // 2, 2), most_recent)
-        now[:], b_now[:], before[:], b_before[:] = 0.0, 0.0, 0.0, 0.0
-        late = early = 0.0
-        late_slot, early_slot = -1, -1
+        recent = min(max(_count(dof[n]) // 2, 2), most_recent)
+        total[:], told[:], age[:], slots[:] = 0.0, 0.0, 0.0, -1
         for w in range(A.shape[1]):
             if dof[n, w] == 0:
                 continue
-            if ages[w] < recent:
-                _add(now, A[n, w], 1.0)
-                _add_times(b_now, A[n, w], p[n, w], 1.0)
-                late += ages[w] * trace(A[n, w])
-                if late_slot < 0 or ages[w] < ages[late_slot]:
-                    late_slot = w
-            else:
-                _add(before, A[n, w], 1.0)
-                _add_times(b_before, A[n, w], p[n, w], 1.0)
-                early += ages[w] * trace(A[n, w])
-                if early_slot < 0 or ages[w] > ages[early_slot]:
-                    early_slot = w
-        lag[m] = max(early / max(trace(before), LEAST) - late / max(trace(now), LEAST), 1.0)
-        invert_symmetric(now, PART * trace(now) + 1e3 * LEAST, P_now)
-        invert_symmetric(before, PART * trace(before) + 1e3 * LEAST, P_before)
+            side = 0 if ages[w] < recent else 1
+            add(total[side], A[n, w], 1.0)
+            add_times(told[side], A[n, w], p[n, w], 1.0)
+            age[side] += ages[w] * trace(A[n, w])
+            if slots[side] < 0 or (ages[w] < ages[slots[side]]) == (side == 0):
+                slots[side] = w
+        for side in range(2):
+            size = trace(total[side])
+            age[side] /= max(size, LEAST)
+            invert_symmetric(total[side], PART * size + 1e3 * LEAST, P[side])
+        lag[m] = max(age[1] - age[0], 1.0)
         for i in range(3):
-            d[m, i] = row_times(P_now, i, b_now) - row_times(P_before, i, b_before)
-        _add(P_now, P_before, 1.0)
-        if late_slot >= 0 and early_slot >= 0:
-            _add_slide(P_now, rays[m], centres[late_slot], centres[early_slot], slide)
-        invert_symmetric(P_now, 0.0, W[m])
+            d[m, i] = row_times(P[0], i, told[0]) - row_times(P[1], i, told[1])
+        add(P[0], P[1], 1.0)
+        if slots[0] >= 0 and slots[1] >= 0:
+            _add_slide(P[0], rays[m], centres[slots[0]], centres[slots[1]], slide)
+        invert_symmetric(P[0], 0.0, W[m])
     return d, W, lag
 
 
@@ -215,143 +208,6 @@ def _add_slide(P, ray, late, early, slide):
         P[i, i] += variance
         for j in range(3):
             P[i, j] -= variance * ray[i] * ray[j] / far
-
-
-# ---------------------------------------------------------------------------------------------- windows and bodies
-
-
-@helper
-def _mean(points, A, mean):
-    """Mean of a window's points (W, 3), weighted by their information (W, 3, 3)."""
-    total, P, told = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3)
-    for w in range(len(points)):
-        _add(total, A[w], 1.0)
-        _add_times(told, A[w], points[w], 1.0)
-    invert_symmetric(total, PART * trace(total) + LEAST, P)
-    for i in range(3):
-        mean[i] = row_times(P, i, told)
-
-
-@helper
-def _window_in_body(A, p, anchor, T, there, point, turned):
-    """One measurement's point (3,) and information (3, 3), none where it is not `there`, in a body's axes T."""
-    away = p[0] + anchor[0] - T[0, 3], p[1] + anchor[1] - T[1, 3], p[2] + anchor[2] - T[2, 3]
-    for i in range(3):
-        point[i] = row_times(T.T, i, away)
-    if there:
-        turn(T.T, A, turned)
-    else:
-        turned[:] = 0.0
-
-
-@kernel
-def windows_in_body(A, p, dof, anchor, rows, history, known):
-    """What tracks measured, in the coordinates of a body with poses `history` (W, 4, 4) at the slots `known` (W,).
-
-    Points (M, W, 3), their information (M, W, 3, 3), and whether there is any (M, W).
-    """
-    size = A.shape[1]
-    points, turned = np.empty((len(rows), size, 3)), np.empty((len(rows), size, 3, 3))
-    there = np.empty((len(rows), size), np.bool_)
-    for m in range(len(rows)):
-        n = rows[m]
-        for w in range(size):
-            there[m, w] = known[w] and dof[n, w] > 0
-            _window_in_body(A[n, w], p[n, w], anchor[n], history[w], there[m, w], points[m, w], turned[m, w])
-    return points, turned, there
-
-
-@kernel
-def weighted_means(points, A):
-    """Means (M, 3) of points by slot (M, W, 3), weighted by their information (M, W, 3, 3)."""
-    means = np.empty((len(points), 3))
-    for m in range(len(points)):
-        _mean(points[m], A[m], means[m])
-    return means
-
-
-@kernel
-def membership_squares(A, p, dof, anchor, rows, history, known):
-    """χ² (M, 2) of "one fixed point" in a body with poses `history` (W, 4, 4) and in the world, over its slots.
-
-    These are the slots `known` (W,). And how many of them, and how many numbers in them, were measured (M, 2).
-    """
-    out, counts, size = np.zeros((len(rows), 2)), np.zeros((len(rows), 2), np.int64), A.shape[1]
-    points, turned, world, mean = np.empty((size, 3)), np.empty((size, 3, 3)), np.zeros((size, 3, 3)), np.empty(3)
-    for m in range(len(rows)):
-        n = rows[m]
-        for w in range(size):
-            there = known[w] and dof[n, w] > 0
-            _window_in_body(A[n, w], p[n, w], anchor[n], history[w], there, points[w], turned[w])
-            world[w] = 0.0
-            if there:
-                _add(world[w], A[n, w], 1.0)
-                counts[m, 0] += 1
-                counts[m, 1] += dof[n, w]
-        out[m, 0], out[m, 1] = _square(points, turned, mean), _square(p[n], world, mean)
-    return out, counts
-
-
-@helper
-def _square(points, A, mean):
-    """χ² of "one fixed point" for points by slot (W, 3) with information (W, 3, 3); the point is put into `mean`."""
-    total = 0.0
-    _mean(points, A, mean)
-    for w in range(len(points)):
-        total += square(A[w], (points[w, 0] - mean[0], points[w, 1] - mean[1], points[w, 2] - mean[2]))
-    return total
-
-
-@kernel
-def place_members(T, P, local, information, rows, least, position, covariance):
-    """Positions and covariances in the world, in place, of tracks at `local` (N, 3) in a body at T, its covariance P.
-
-    Their points have `information` (N, 3, 3) in its axes, and `least` more.
-    """
-    spread, J, v = np.empty((3, 3)), np.empty((3, 6)), np.empty(6)
-    for m in range(len(rows)):
-        n = rows[m]
-        transform(T, local[n], position[n])
-        invert_symmetric(information[n], least, spread)
-        point_by_motion(local[n], 1.0, J)
-        for i in range(3):
-            for k in range(6):
-                v[k] = row_times(P, k, J[i]) + P[k, 3 + i]
-            for j in range(3):
-                spread[i, j] += row_times(J, j, v) + v[3 + j]
-        turn(T, spread, covariance[n])
-
-
-@kernel
-def improve_members(T, A, p, anchor, rows, slot, local, information):
-    """Take the measurements of a slot into the points of a body at T and their information (N, 3, 3), in place."""
-    turned, P, gap, told = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
-    for m in range(len(rows)):
-        n = rows[m]
-        _window_in_body(A[n, slot], p[n, slot], anchor[n], T, True, gap, turned)
-        _add(information[n], turned, 1.0)
-        invert_symmetric(information[n], RIDGE * trace(information[n]), P)
-        for i in range(3):
-            gap[i] -= local[n, i]
-        for i in range(3):
-            told[i] = row_times(turned, i, gap)
-        for i in range(3):
-            local[n, i] += row_times(P, i, told)
-
-
-@kernel
-def distances_from_box(T, lower, upper, position, covariance, rows):
-    """Squared distances (M,), in their own noise, of tracks from the box between two corners in a body's axes T."""
-    out, local, away, gap, P = np.empty(len(rows)), np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
-    for m in range(len(rows)):
-        transform_back(T, position[rows[m]], local)
-        for i in range(3):
-            away[i] = local[i] - min(max(local[i], lower[i]), upper[i])
-        for i in range(3):
-            gap[i] = row_times(T, i, away)
-        invert_symmetric(covariance[rows[m]], RIDGE * trace(covariance[rows[m]]) + LEAST, P)
-        out[m] = square(P, gap)
-    return out
 
 
 # ---------------------------------------------------------------------------------------------- pixels
@@ -374,13 +230,11 @@ def expected_pixels(camera, T_world_left, position, covariance, dof, rows, sigma
             z[m, i] = -z[m, i]
             by_point(J[i], T_world_left, G[i])
         turn(G, covariance[rows[m]], S[m])
-        count = 0
-        for w in range(dof.shape[1]):
-            count += dof[rows[m], w] > 0
         for i in range(3):
             S[m, i, i] += sigma * sigma
         deviation = np.sqrt(max(S[m, 2, 2], sigma * sigma))  # rounding may leave a covariance that is not definite
-        allowance[m] = sigmas * deviation + (reach[0] if count < least else reach[1]) / max(local[2], 1e-3)
+        uneven = reach[0] if _count(dof[rows[m]]) < least else reach[1]
+        allowance[m] = sigmas * deviation + uneven / max(local[2], 1e-3)
     return z, S, allowance
 
 
