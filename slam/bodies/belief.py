@@ -120,26 +120,18 @@ def begun(stamp: float, T_body_left: Array, velocity: Array, sigmas: Array, esti
 
 def carried(b: BodyBelief, cameras: RecentPoses, models: ObjectModels) -> Motion:
     """The motion between the frames, for the camera's poses in them (K)."""
-    triples, intervals, means, variances = [], [], [], []
-    for i in range(1, len(b)):
-        first = i == 1
-        if first and b.stamps[0] != b.since:
-            continue  # what is known of this interval is in the prior
-        dt = b.stamps[i] - b.stamps[i - 1]
-        linear, angular = models.velocity_variance(dt)
-        variance = b.scales[i] ** 2 * np.repeat([angular, linear], 3)
-        mean: Array = np.zeros(6)
-        if first:
-            variance, mean = variance + b.sigmas**2, b.velocity.copy()
-            mean[:3] = b.poses[0][:3, :3] @ cameras.poses[0][:3, :3].T @ b.velocity[:3]
-        triples.append((i - 2, i - 1, i))
-        intervals.append((1.0 if first else b.stamps[i - 1] - b.stamps[i - 2], dt))
-        means.append(mean)
-        variances.append(variance)
-    if not triples:
+    first = 1 if b.stamps[0] == b.since else 2  # else what is known of the first interval is in the prior
+    at, dt = np.arange(first, len(b)), np.diff(b.stamps)
+    if not len(at):
         return Motion.none()
-    rows = (np.array(triples), np.array(intervals), np.array(means), np.array(variances))
-    return Motion(*rows, cameras.poses, cameras.covariance)
+    variance = (b.scales[at] ** 2 * dt[at - 1])[:, None] * np.repeat(models.velocity_variance(1.0)[::-1], 3)
+    before, mean = np.where(at > 1, dt[at - 2], 1.0), np.zeros((len(at), 6))
+    if first == 1:
+        variance[0] += b.sigmas**2
+        mean[0] = b.velocity
+        mean[0, :3] = b.poses[0][:3, :3] @ cameras.poses[0][:3, :3].T @ b.velocity[:3]
+    triples, intervals = at[:, None] + np.arange(-2, 1), np.column_stack([before, dt[at - 1]])
+    return Motion(triples, intervals, mean, variance, cameras.poses, cameras.covariance)
 
 
 def window(b: BodyBelief, stereo: RectifiedStereo, motion: Motion) -> Window:

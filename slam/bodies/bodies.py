@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.bodies.belief import EVEN, BodyBelief, when_measured, when_missed
+from slam.bodies.body_kernels import windows_in_body
 from slam.bodies.config import CLEAR, MIN_FRAMES
-from slam.bodies.track_kernels import windows_in_body
 from slam.data import BoolArray
 from slam.geometry.arrays import changed
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, so3_exp, transform, twice
@@ -71,8 +71,8 @@ class Body:
             return math.inf
         A = adjoint(self.belief.poses[-1])
         P = A @ self.belief.covariance[-6:, -6:] @ A.T + self.covariance - self.belief.estimate.covariance
-        J = points_by_pose(np.stack([self.lower, self.upper]))
-        return math.sqrt(max(float(np.einsum("nij,jk,nik->", J, P, J)) / len(J), 0.0))
+        J = points_by_pose(np.stack([self.lower, self.upper])).reshape(-1, 6)
+        return math.sqrt(max(float(np.vdot(J @ P, J)) / 2.0, 0.0))
 
     @property
     def gone(self) -> bool:
@@ -197,10 +197,10 @@ def hidden(bodies: Iterable[Body], eye: Array, points: Array) -> BoolArray:
 
 def with_evidence(body: Body, gain: float, agreeing: int, against: int) -> Body:
     """The body after what this frame says of its existence, see `slam.bodies.belief`, and of what it encloses."""
-    body = changed(body, agreeing=body.agreeing + agreeing, against=body.against + against)
-    if body.measured:
-        return changed(body, existence=when_measured(body.existence, gain))
-    return changed(body, existence=when_missed(body.existence, body.seen, body.age))
+    existence = (
+        when_measured(body.existence, gain) if body.measured else when_missed(body.existence, body.seen, body.age)
+    )
+    return changed(body, agreeing=body.agreeing + agreeing, against=body.against + against, existence=existence)
 
 
 def with_extent(body: Body, local: Array) -> Body:

@@ -22,7 +22,7 @@ from slam.bodies.bodies import (
 from slam.bodies.config import CLEAR, MIN_FRAMES, RUN, WINDOW, ObjectsConfig
 from slam.bodies.estimator import FRAMES, BodyEstimator
 from slam.bodies.finder import Scene, parting
-from slam.bodies.fits import fit_positions, fit_velocities, record, revise_tracks
+from slam.bodies.fits import fit, fit_positions, record, revise_tracks
 from slam.bodies.following import follow, found_again, located, observed
 from slam.bodies.frame import NO_IDS, Frame, Setup
 from slam.bodies.membership import merge
@@ -199,9 +199,10 @@ class MovingObjectDetector(ObjectDetector):
         T = found_again(body, tracks, frame) if body.gone else None
         if T is not None:
             return returned(body, T, slot, stamp)
-        mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
-        front = (b for b in self.bodies.values() if b.proven and not b.gone and b.id != body.id)
-        tracks.row[mine[hidden(front, frame.eye, tracks.position[mine])]] = -1
+        front = [b for b in self.bodies.values() if b.proven and not b.gone and b.id != body.id]
+        if front:
+            mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
+            tracks.row[mine[hidden(front, frame.eye, tracks.position[mine])]] = -1
         belief = located(body, tracks, frame, self._estimator)
         if belief is None or not self.setup.models.known(belief.estimate):  # it begins anew once it is found again
             return changed(body, belief=None)
@@ -209,12 +210,8 @@ class MovingObjectDetector(ObjectDetector):
 
     def _fit(self, tracks: Tracks, frame: Frame) -> None:
         """Positions of free tracks, and velocities of those that may move."""
-        c = self.setup.config
         free = np.flatnonzero((tracks.body < 0) & tracks.found)
-        count = tracks.count(free)
-        unsure = (count < MIN_FRAMES) | tracks.doubtful[free] | tracks.velocity[free].any(axis=1)
-        fit_positions(tracks, free)
-        fit_velocities(tracks, free[unsure & (count > 1)], frame.times, c.max_speed)
+        fit(tracks, free, frame.times, self.setup.config.max_speed)
 
     def _change_members(self, tracks: Tracks, frame: Frame) -> None:
         """Update the bodies' members; bodies that do not move are dropped."""

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -28,13 +29,13 @@ from slam.bodies import scene_kernels as kernels
 from slam.bodies.belief import compact
 from slam.bodies.bodies import Body, in_body_axes, new_body
 from slam.bodies.config import MIN_FRAMES, MIN_POINTS, RUN, WINDOW
-from slam.bodies.fits import constant_velocity, fit_velocities, measure, times_vectors
+from slam.bodies.fits import constant_velocity, fit, record_in, times_vectors
 from slam.bodies.frame import Frame, Setup
 from slam.bodies.regions import Region
-from slam.bodies.track_kernels import displaced
+from slam.bodies.track_kernels import displaced, well_known
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray, IndexArray, StereoFeatures
-from slam.geometry.arrays import among, quantile
+from slam.geometry.arrays import among, changed, quantile
 from slam.geometry.rig import MINIMAL_POINTS, measurement_rows
 from slam.geometry.se3 import Array, hat, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
@@ -110,24 +111,15 @@ def moved_in(body: Body | None, tracks: Tracks, rows: IndexArray, frame: Frame) 
     return Displacements(inside, *displaced(A, points, dof, np.arange(len(rows)), ages, _RECENT, rays, eyes, 0.0))
 
 
-def known_well(tracks: Tracks, rows: IndexArray, T_world_left: Array) -> tuple[IndexArray, Array]:
-    """Those of the tracks (K,) seen in enough frames whose depth is known, and where: x/z, y/z, log z (K, 3)."""
-    rows = rows[tracks.count(rows) >= MIN_FRAMES]
-    local = (tracks.position[rows] - T_world_left[:3, 3]) @ T_world_left[:3, :3]
-    variance = np.einsum("nii->n", tracks.covariance[rows])
-    known = local[:, 2] > FARTHEST * np.sqrt(np.where(variance < 0, np.inf, variance))  # below 0 by rounding alone
-    return rows[known], places_in_view(local[known])
-
-
 def places_in_view(local: Array) -> Array:
     """Where points (N, 3) in camera coordinates are seen: x/z, y/z, log z (N, 3)."""
     depth = np.maximum(local[:, 2:], 1e-9)
     return np.column_stack([local[:, :2] / depth, np.log(depth)])
 
 
-def limit(test: float, size: IndexArray | int) -> Array:
+def limit(test: float, size: Any) -> Any:
     """χ²(6) from which a group of so many tracks moved: small groups have the heavier tails of single tracks."""
-    return test * (1.0 + _TAIL / np.maximum(size, 1.0))
+    return test * (1.0 + _TAIL / size)
 
 
 def classify_scene(moved: Displacements, place: Array, test: float, least: int = MIN_POINTS) -> Scene:
@@ -141,7 +133,7 @@ def classify_scene(moved: Displacements, place: Array, test: float, least: int =
     if n < 3 * MIN_POINTS:
         return Scene([], np.zeros(n), np.zeros(6), np.diag(1.0 / kernels.PRIOR))
     sums = kernels.normal_equations(moved.points, moved.d, moved.W, moved.lag)
-    asked = limit(test, np.arange(n + 1, dtype=np.intp))
+    asked = limit(test, np.maximum(np.arange(n + 1), 1))
     codes = np.sort(kernels.window_codes(place, _SIZES), axis=1)
     group, values, alone, common, information, scale = kernels.groups_apart(sums, place, codes, _SIZES, asked, least)
     heavier = tail(alone[group < 0])  # of what is in no group: before, other groups would be part of it
@@ -180,7 +172,7 @@ def find_groups(
     tracks.doubtful[:] = False
     tracks.doubtful[rows] = (scene.alone > kernels.FITS) & ~tracks.still[rows]
     tracks.doubtful[suspects] = True
-    fit_velocities(tracks, np.flatnonzero(tracks.doubtful), frame.times, c.max_speed)
+    fit(tracks, np.flatnonzero(tracks.doubtful), frame.times, c.max_speed)
     of_parts = among(len(tracks), np.concatenate([np.zeros(0, np.intp), *(members for _, members in parts)]))
     alike = of_parts | among(len(of_parts), np.concatenate([np.zeros(0, np.intp), *moving]))
     tracks.streak[:] = np.where(alike, tracks.streak + 1, np.maximum(tracks.streak - 1, 0))
@@ -199,7 +191,8 @@ def lasting(group: tuple[int | None, IndexArray], tracks: Tracks, frame: Frame) 
 
 def _classified(frame: Frame, tracks: Tracks, rows: IndexArray, body: Body | None = None) -> tuple[IndexArray, Scene]:
     """Those of the tracks that are known well, tested in the world or in a body's axes."""
-    rows, place = known_well(tracks, rows, frame.T_world_left)
+    t = tracks
+    rows, place = well_known(frame.T_world_left, t.position, t.covariance, t.dof, rows, MIN_FRAMES, FARTHEST)
     return rows, classify_scene(moved_in(body, tracks, rows, frame), place, frame.setup.config.suspect)
 
 
@@ -268,10 +261,16 @@ def parting(
     """
     t, free, slot = tracks, tracks.body[at] < 0, now % WINDOW
     at, rows = at[free], rows[free]
-    position, A, p, dof = t.position[at], t.A[at], t.p[at], t.dof[at]
     z = measurement_rows(features.uv_left[rows], features.uv_right[rows])
-    points, A[:, slot], dof[:, slot] = measure(setup.rig, T_world_left, position, z, setup.sigma)
-    p[:, slot] = points - t.anchor[at]
+    position, A, p, dof = t.position[at], t.A[at], t.p[at], t.dof[at]
+    record_in(
+        changed(t, position=position, anchor=t.anchor[at], A=A, p=p, dof=dof),
+        np.arange(len(at)),
+        setup,
+        T_world_left,
+        z,
+        slot,
+    )
     local = transform(inverse(T_world_left), position)
     known = local[:, 2] > FARTHEST * np.sqrt(np.trace(t.covariance[at], axis1=1, axis2=2))
     well = known & (dof[:, slot] > 0) & (t.count(at) >= MIN_FRAMES)

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.bodies.bodies import Body
-from slam.bodies.frame import Frame
-from slam.bodies.track_kernels import constant_velocities, fit_fixed_points, points_on_rays
-from slam.data import IndexArray
+from slam.bodies.config import MIN_FRAMES
+from slam.bodies.frame import Frame, Setup
+from slam.bodies.track_kernels import fit_tracks, measure
+from slam.data import BoolArray, IndexArray
 from slam.geometry.rig import StereoRig, measurement_rows
 from slam.geometry.se3 import Array
 from slam.tracks.table import Tracks
@@ -22,30 +23,42 @@ MOVES = 12.0  #: derived: χ²(3) at 99.3 % of the velocity, from which it count
 AGREES = 11.3  #: derived: χ²(3) at 99 %, of places or velocities that are the same
 
 
-def measure(rig: StereoRig, T_world_left: Array, points: Array, measured: Array, sigma: float) -> tuple:
-    """Points (N, 3) measured by pixels (N, 3), their information (N, 3, 3), and how many numbers were measured (N,).
-
-    Each is linearised on the measured ray, at the depth of the expected one of the `points` (N, 3): so the left pixel
-    is met exactly, and the depth is linear in the disparity and therefore free of bias; only where the expected point
-    is far off, at the measured depth. Rows whose uR is NaN have no information along the ray; unusable rows none.
-    """
-    found: tuple = points_on_rays(rig.rectified_parameters, T_world_left, points, measured, sigma, _TOO_FAR, _STEPS)
-    return found
-
-
 def record(tracks: Tracks, rows: IndexArray, frame: Frame) -> None:
     """Enter what the features of tracks (K,) measure in this frame, in place."""
-    f, slot, at, s = frame.features, frame.slot, tracks.row[rows], frame.setup
+    f, at = frame.features, tracks.row[rows]
     z = measurement_rows(f.uv_left[at], f.uv_right[at])
-    points, A, dof = measure(s.rig, frame.T_world_left, tracks.position[rows], z, s.sigma)
-    tracks.A[rows, slot], tracks.p[rows, slot], tracks.dof[rows, slot] = A, points - tracks.anchor[rows], dof
+    record_in(tracks, rows, frame.setup, frame.T_world_left, z, frame.slot)
+
+
+def record_in(tracks: Tracks, rows: IndexArray, setup: Setup, T_world_left: Array, z: Array, slot: int) -> None:
+    """Enter pixels (K, 3) of tracks (K,) into a slot of their windows, as points with their information, in place.
+
+    Each is linearised on the measured ray, at the depth of the expected point: so the left pixel is met exactly, and
+    the depth is linear in the disparity and therefore free of bias; only where the expected point is far off, at the
+    measured depth. Rows whose uR is NaN have no information along the ray; unusable rows none.
+    """
+    t, camera = tracks, setup.rig.rectified_parameters
+    measure(camera, T_world_left, t.position, t.anchor, z, rows, slot, setup.sigma, _TOO_FAR, _STEPS, t.A, t.p, t.dof)
 
 
 def fit_positions(tracks: Tracks, rows: IndexArray) -> None:
     """Fit fixed points to the windows of tracks, in place."""
+    tracks.velocity[rows] = 0
+    _fit(tracks, rows, np.zeros(len(tracks), bool), 0, np.zeros(tracks.dof.shape[1]), 0.0)
+
+
+def fit(tracks: Tracks, rows: IndexArray, times: Array, max_speed: float) -> None:
+    """Fit windows of tracks, in place: those that may move have a velocity where a fixed point does not explain them.
+
+    Those may that are in doubt, had a velocity before, or have few measurements; see `constant_velocity`.
+    """
+    _fit(tracks, rows, tracks.doubtful, MIN_FRAMES, times, max_speed**-2)
+
+
+def _fit(tracks: Tracks, rows: IndexArray, asked: BoolArray, least: int, times: Array, prior: float) -> None:
     t = tracks
-    fit_fixed_points(t.A, t.p, t.anchor, rows, t.position, t.covariance)
-    t.velocity[rows] = 0
+    into = t.position, t.covariance, t.velocity, t.velocity_covariance
+    fit_tracks(t.A, t.p, t.dof, t.anchor, rows, asked, least, times, prior, MOVES, *into)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,17 +77,11 @@ def constant_velocity(tracks: Tracks, rows: IndexArray, times: Array, max_speed:
 
     `max_speed` is the deviation of velocities before anything is known [m/s].
     """
-    points, *rest = constant_velocities(tracks.A, tracks.p, rows, times, max_speed**-2)
-    return ConstantVelocity(tracks.anchor[rows] + points, *rest)
-
-
-def fit_velocities(tracks: Tracks, rows: IndexArray, times: Array, max_speed: float) -> None:
-    """Give tracks a velocity, in place, where a fixed point does not explain them; see `constant_velocity`."""
-    m = constant_velocity(tracks, rows, times, max_speed)
-    moves = m.test > MOVES
-    moving = rows[moves]
-    tracks.velocity[moving], tracks.velocity_covariance[moving] = m.velocity[moves], m.velocity_covariance[moves]
-    tracks.position[moving], tracks.covariance[moving] = m.position[moves], m.covariance[moves]
+    t, n = tracks, len(tracks)
+    (position, velocity), (P, V), every = np.zeros((2, n, 3)), np.zeros((2, n, 3, 3)), np.ones(n, bool)
+    into = position, P, velocity, V
+    test = fit_tracks(t.A, t.p, t.dof, t.anchor, rows, every, 0, times, max_speed**-2, -np.inf, *into)
+    return ConstantVelocity(position[rows], P[rows], velocity[rows], V[rows], test)
 
 
 def times_vectors(M: Array, v: Array) -> Array:

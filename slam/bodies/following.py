@@ -8,15 +8,16 @@ import numpy as np
 
 from slam.bodies.belief import BodyBelief
 from slam.bodies.bodies import Body, of_bodies
+from slam.bodies.body_kernels import place_members
 from slam.bodies.config import MIN_FRAMES, MIN_POINTS
 from slam.bodies.estimator import BodyEstimator
 from slam.bodies.frame import Frame
-from slam.bodies.track_kernels import expected_pixels, inverses
+from slam.bodies.track_kernels import expected_pixels
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among, isin
 from slam.geometry.rig import MINIMAL_POINTS, measurement_rows
-from slam.geometry.se3 import Array, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array, inverse, transform
 from slam.object_data import ObjectObservations
 from slam.tracks import follow as features_of_tracks
 from slam.tracks.follow import match_everywhere
@@ -62,10 +63,8 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: IndexArray, dt: 
     tracks.covariance[moves] += dt**2 * tracks.velocity_covariance[moves]
     for body in bodies.values():
         mine = np.flatnonzero(tracks.body == body.id)
-        R, J = body.T[:3, :3], points_by_pose(tracks.local[mine])
-        own = inverses(tracks.local_information[mine], 0.0, _UNKNOWN)
-        spread = own + J @ body.covariance @ np.swapaxes(J, 1, 2)
-        tracks.position[mine], tracks.covariance[mine] = transform(body.T, tracks.local[mine]), R @ spread @ R.T
+        t = tracks
+        place_members(body.T, body.covariance, t.local, t.local_information, mine, _UNKNOWN, t.position, t.covariance)
 
 
 def _look(tracks: Tracks, frame: Frame, rows: IndexArray, taken: BoolArray) -> None:
@@ -73,18 +72,18 @@ def _look(tracks: Tracks, frame: Frame, rows: IndexArray, taken: BoolArray) -> N
     if not len(rows):
         return
     s, c, f, T = frame.setup, frame.setup.config, frame.features, frame.T_world_left
-    z, S = expected_pixels(s.rig.rectified_parameters, T, tracks.position, tracks.covariance, rows, s.sigma)
+    t, reach = tracks, c.max_speed * frame.dt * s.rig.left.fu
+    z, S, allowance = expected_pixels(
+        s.rig.rectified_parameters, T, t.position, t.covariance, t.dof, rows, s.sigma, _RIGHT_SIGMAS, MIN_FRAMES,
+        (reach, _UNEVEN * reach),
+    )  # fmt: skip
     least = np.where(tracks.doubtful[rows], 0.5 * _SEARCH[1], _SEARCH[0])
     windows = features_of_tracks.Windows((SIGMAS,), (_ALIKE[0],), _ALIKE[1], _SEARCH[1], least)
     looks = tracks.look[rows], tracks.laplacian[rows]
     found = features_of_tracks.follow(z[:, :2], S[:, :2, :2], *looks, f, windows, taken)
     m, row = found.tracks, found.features
-    # A right pixel off by more says that this is another point, or a false stereo match.
-    depth = np.maximum((tracks.position[rows[m]] - T[:3, 3]) @ T[:3, 2], 1e-3)
-    uneven = np.where(tracks.count(rows[m]) < MIN_FRAMES, 1.0, _UNEVEN)
-    deviation = np.sqrt(np.maximum(S[m, 2, 2], s.sigma**2))  # rounding may leave a covariance that is not definite
-    allowance = _RIGHT_SIGMAS * deviation + uneven * c.max_speed * frame.dt * s.rig.left.fu / depth
-    good = ~(np.abs(f.uv_right[row, 0] - z[m, 2]) > allowance)  # NaN compares false
+    # A right pixel off by more says that this is another point, or a false stereo match; NaN compares false.
+    good = ~(np.abs(f.uv_right[row, 0] - z[m, 2]) > allowance[m])
     tracks.set_features(rows[m[good]], row[good])
     taken[row[good]] = True
 
@@ -113,7 +112,8 @@ def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) 
     """
     mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
     # any two points agree with a pose of a body that may be half its width off, any three if it may be anywhere
-    least = MIN_POINTS if body.off > body.across else MINIMAL_POINTS if 2.0 * body.off > body.across else 1
+    off = body.off / body.across
+    least = MIN_POINTS if off > 1.0 else MINIMAL_POINTS if off > 0.5 else 1
     seen = observed(body, tracks, mine, frame.features)
     belief = estimator.updated(body.belief, body.id, seen, frame.cameras, least)
     rows = tracks.row[mine]
@@ -123,7 +123,7 @@ def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) 
     agrees = isin(tracks.number[mine], belief.estimate.used)
     tracks.misfit[mine] = np.where(agrees, 0, tracks.misfit[mine] + 1)
     _take_from_free(tracks, rows[agrees])
-    left = agrees | ~isin(rows, tracks.row[tracks.found])
+    left = agrees | ~among(len(frame.local), tracks.row[tracks.found])[rows]
     tracks.row[mine[left]] = rows[left]
     tracks.look[mine[agrees]] = frame.features.descriptors[rows[agrees]]
     return belief
@@ -157,8 +157,8 @@ def found_again(body: Body, tracks: Tracks, frame: Frame) -> Array | None:
 
 def _take_from_free(tracks: Tracks, features: IndexArray) -> None:
     """Features (K,) are a body's: free tracks that have them are given up, in place."""
-    free = np.flatnonzero((tracks.body < 0) & tracks.found)
-    tracks.give_up(free[isin(tracks.row[free], features)])
+    taken = among(int(max(tracks.row.max(), features.max(initial=0))) + 1, features)
+    tracks.give_up(np.flatnonzero((tracks.body < 0) & tracks.found & taken[tracks.row]))
 
 
 def observed(body: Body, tracks: Tracks, mine: IndexArray, features: StereoFeatures) -> ObjectObservations:

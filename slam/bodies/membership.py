@@ -13,10 +13,11 @@ from functools import cache
 import numpy as np
 
 from slam.bodies.bodies import Body, hidden, in_body_axes, of_bodies, with_extent
+from slam.bodies.body_kernels import distances_from_box, improve_members, membership_squares, weighted_means
 from slam.bodies.config import CLEAR, EXPLAINED, MIN_FRAMES, RUN, WINDOW
 from slam.bodies.fits import fit_positions, times_vectors
 from slam.bodies.frame import Frame
-from slam.bodies.track_kernels import LEAST, RIDGE, distances_from_box, inverses, squares, weighted_means
+from slam.bodies.track_kernels import LEAST
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.arrays import changed
@@ -36,12 +37,17 @@ def membership_test(body: Body, tracks: Tracks, rows: IndexArray) -> tuple[Array
 
     By how much χ² the body explains them better, whether it explains them at all, and the frames that say so (N,) each.
     """
-    points, A, known = in_body_axes(body, tracks, rows)
-    dof = np.where(known, tracks.dof[rows], 0)
-    fixed, still, count = squares(points, A), _still(tracks, rows, known), known.sum(axis=1)
-    limit = _limits(3 * dof.shape[1])[np.maximum(dof.sum(axis=1) - 3, 1)]
+    (fixed, still), (count, numbers) = _squares(body, tracks, rows)
+    limit = _limits(3 * WINDOW)[np.maximum(numbers - 3, 1)]
     fits = (fixed < limit) | ((fixed < EXPLAINED * still) & (fixed < _LOOSE * limit))
     return still - fixed, fits, count
+
+
+def _squares(body: Body, tracks: Tracks, rows: IndexArray) -> tuple[Array, IndexArray]:
+    """χ² of "one fixed point" in a body and in the world (2, N), and the slots and numbers that they are of (2, N)."""
+    t = tracks
+    found, counts = membership_squares(t.A, t.p, t.dof, t.anchor, rows, body.history, body.known)
+    return found.T, counts.T
 
 
 @cache
@@ -209,7 +215,7 @@ def distinctness(one: Body, ones: IndexArray, other: Body, others: IndexArray, t
     one, other = changed(one, known=both), changed(other, known=both)
 
     def left(body: Body, rows: IndexArray) -> float:
-        return float(squares(*in_body_axes(_with_poses_fitted(body, tracks, rows), tracks, rows)[:2]).sum())
+        return float(_squares(_with_poses_fitted(body, tracks, rows), tracks, rows)[0][0].sum())
 
     every = np.concatenate([ones, others])
     more = left(one, every) - left(one, ones) - left(other, others)
@@ -227,18 +233,9 @@ def _distances(body: Body, tracks: Tracks, rows: IndexArray, margin: float) -> A
 
 def _improve(body: Body, tracks: Tracks, slot: int) -> None:
     """Take this frame's measurements into the members' points, in place."""
-    t, R = tracks, body.T[:3, :3]
+    t = tracks
     mine = np.flatnonzero((t.body == body.id) & (t.misfit == 0) & (t.dof[:, slot] > 0))
-    gap = (t.p[mine, slot] + t.anchor[mine] - body.T[:3, 3]) @ R - t.local[mine]
-    turned = R.T @ t.A[mine, slot] @ R
-    total = t.local_information[mine] + turned
-    t.local_information[mine] = total
-    t.local[mine] += times_vectors(inverses(total, RIDGE, 0.0), times_vectors(turned, gap))
-
-
-def _still(tracks: Tracks, rows: IndexArray, known: BoolArray) -> Array:
-    """χ² (N,) of "one fixed point in the world" in the slots of tracks that are `known` (N, W)."""
-    return squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0))
+    improve_members(body.T, t.A, t.p, t.anchor, mine, slot, t.local, t.local_information)
 
 
 def merge(bodies: dict[int, Body], tracks: Tracks) -> None:
@@ -274,8 +271,8 @@ def _apart(body: Body, mine: IndexArray, other: Body, theirs: IndexArray, tracks
     whole, few, rows = (other, body, mine) if larger else (body, other, theirs)
     near = _distances(whole, tracks, rows, 2.0 * MARGIN * (1.0 + few.across / whole.across)) < _NEAR
     beside = 2 * near.sum() > len(rows)
-    points, A, known = in_body_axes(whole, tracks, rows)
-    left = squares(points, A).sum() / max(float(_still(tracks, rows, known).sum()), LEAST)
+    fixed, still = _squares(whole, tracks, rows)[0].sum(axis=1)
+    left = fixed / max(still, LEAST)
     explained = beside and left < 2 * EXPLAINED  # as a share of the χ² of "still"
     if explained and larger and not part and body.seen <= WINDOW:
         return 0.0

@@ -134,9 +134,11 @@ def _by_frames(places: Array, times: Array) -> float:
     if n < MIN_POINTS:
         return 0.0
     t = times - times.mean()
-    basis, _ = np.linalg.qr(np.stack([np.ones(n), t, t * t], axis=1))
-    offset = places - places.mean(axis=0)
-    squares = np.array([(offset[:, :k] ** 2).sum() for k in (1, len(_ENDS))])  # of the middle, and of all
-    ways = [((basis[:, 1:].T @ offset[:, :k].reshape(n, -1)) ** 2).sum() for k in (1, len(_ENDS))]
-    ratio = np.max(ways / (np.maximum(squares - ways, 0.0) + _WEAK))
+    bend = t * t - (t @ t) / n
+    bend -= t * ((bend @ t) / (t @ t))
+    basis = np.array([t / np.sqrt(t @ t), bend / np.sqrt(bend @ bend)])
+    offset = (places - places.mean(axis=0)).reshape(n, -1)
+    ways, squares = np.square(basis @ offset).sum(axis=0), np.square(offset).sum(axis=0)  # of the middle first
+    both = ((float(ways[:k].sum()), float(squares[:k].sum())) for k in (3, len(ways)))
+    ratio = max(way / (max(every - way, 0.0) + _WEAK) for way, every in both)
     return _evidence(2.0 * float(fdtrc(6, 3 * n - 9, ratio * (3 * n - 9) / 6.0)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import invert_symmetric, multiply, row_times, square, trace, turn
+from slam.kernels.linear import assign, invert_symmetric, multiply, row_times, trace, turn
 from slam.kernels.se3 import transform, transform_back
 from slam.kernels.stereo import by_point, residual
 from slam.runtime.compilation import disjoint_helper, helper, kernel
@@ -20,25 +20,18 @@ LEAST = 1e-12  #: numerics: and this for windows that are empty
 
 
 @helper
-def _add(total, M, factor):
+def add(total, M, factor):
+    """Add a factor times M (3, 3)."""
     for i in range(3):
         for j in range(3):
             total[i, j] += factor * M[i, j]
 
 
 @helper
-def _add_times(total, M, v, factor):
+def add_times(total, M, v, factor):
+    """Add a factor times ``M v`` (3,)."""
     for i in range(3):
         total[i] += factor * row_times(M, i, v)
-
-
-@kernel
-def inverses(M, share, least):
-    """Inverses of symmetric matrices (N, 3, 3) with a `share` of the trace and `least` added to the diagonal."""
-    out = np.empty_like(M)
-    for n in range(len(M)):
-        invert_symmetric(M[n], share * trace(M[n]) + least, out[n])
-    return out
 
 
 @disjoint_helper
@@ -69,59 +62,93 @@ def _add_four(total, a, b, c, d, weight):
 # ---------------------------------------------------------------------------------------------- windows of tracks
 
 
+@helper
+def _count(dof):
+    """In how many slots (W,) something was measured."""
+    count = 0
+    for w in range(len(dof)):
+        count += dof[w] > 0
+    return count
+
+
 @kernel
-def fit_fixed_points(A, p, anchor, rows, position, covariance):
-    """Fixed points that fit the windows best, and their covariances, into `position` (N, 3), `covariance` (N, 3, 3)."""
-    total, told = np.empty((3, 3)), np.empty(3)
+def fit_tracks(A, p, dof, anchor, rows, asked, least, times, prior, moves, position, covariance, velocity, spread):
+    """Fixed points that fit the windows best, in place; or points with an even velocity, where its χ² is above `moves`.
+
+    A velocity is sought for tracks that are `asked` for (N,), have one already, or were measured less than `least`
+    times, but twice. Slots have `times` (W,) less the present [s], to which positions refer; `prior` is the information
+    on each axis of the velocity before anything is known [s²/m²]; `spread` (N, 3, 3) are the velocities' covariances.
+    Returns χ²(3) of the velocities (M,), 0 where none was sought.
+    """
+    test, even, M2, S, G = np.zeros(len(rows)), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    M0, M1, P, b0, b1, told = (
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty(3),
+        np.empty(3),
+        np.empty(3),
+    )
     for m in range(len(rows)):
         n = rows[m]
-        total[:], told[:] = 0.0, 0.0
-        for w in range(A.shape[1]):
-            _add(total, A[n, w], 1.0)
-            _add_times(told, A[n, w], p[n, w], 1.0)
-        invert_symmetric(total, RIDGE * trace(total) + LEAST, covariance[n])
-        for i in range(3):
-            position[n, i] = anchor[n, i] + row_times(covariance[n], i, told)
-
-
-@kernel
-def constant_velocities(A, p, rows, times, prior):
-    """Points (M, 3) at time 0 and even velocities (M, 3) [m/s] that fit the windows best, with their covariances.
-
-    And χ²(3) of the velocities (M,). Slots have `times` (W,) [s]; `prior` is the information on each axis of the
-    velocity before anything is known [s²/m²].
-    """
-    n = len(rows)
-    points, P, velocity, PV = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3, 3))
-    test = np.zeros(n)
-    M0, M1, M2 = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    P0, G, S = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    b0, b1, told = np.empty(3), np.empty(3), np.empty(3)
-    for m in range(n):
         M0[:], M1[:], M2[:], b0[:], b1[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+        count, had = _count(dof[n]), asked[n]
+        for i in range(3):
+            had = had or velocity[n, i] != 0.0
+            velocity[n, i] = 0.0
+        had = count > 1 and (had or count < least)
         for w in range(A.shape[1]):
-            t, Aw, pw = times[w], A[rows[m], w], p[rows[m], w]
-            _add(M0, Aw, 1.0)
-            _add(M1, Aw, t)
-            _add(M2, Aw, t * t)
-            _add_times(b0, Aw, pw, 1.0)
-            _add_times(b1, Aw, pw, t)
-        invert_symmetric(M0, RIDGE * trace(M0) + LEAST, P0)
-        multiply(P0, M1, G)
+            t, Aw, pw = times[w], A[n, w], p[n, w]
+            add(M0, Aw, 1.0)
+            add_times(b0, Aw, pw, 1.0)
+            if had:
+                add(M1, Aw, t)
+                add(M2, Aw, t * t)
+                add_times(b1, Aw, pw, t)
+        invert_symmetric(M0, RIDGE * trace(M0) + LEAST, covariance[n])
+        for i in range(3):
+            position[n, i] = anchor[n, i] + row_times(covariance[n], i, b0)
+        if not had:
+            continue
+        multiply(covariance[n], M1, G)
         for i in range(3):
             told[i] = b1[i] - row_times(G.T, i, b0)
             for j in range(3):
                 S[i, j] = M2[i, j] - (G[0, i] * M1[0, j] + G[1, i] * M1[1, j] + G[2, i] * M1[2, j])
             S[i, i] += prior
-        invert_symmetric(S, RIDGE * trace(S) + LEAST, PV[m])
+        invert_symmetric(S, RIDGE * trace(S) + LEAST, P)
         for i in range(3):
-            velocity[m, i] = row_times(PV[m], i, told)
-            test[m] += velocity[m, i] * told[i]
-        turn(G, PV[m], P[m])
-        _add(P[m], P0, 1.0)
-        for i in range(3):
-            points[m, i] = row_times(P0, i, b0) - row_times(G, i, velocity[m])
-    return points, P, velocity, PV, test
+            even[i] = row_times(P, i, told)
+            test[m] += even[i] * told[i]
+        if test[m] > moves:
+            turn(G, P, S)
+            add(covariance[n], S, 1.0)
+            assign(P, spread[n])
+            for i in range(3):
+                velocity[n, i] = even[i]
+                position[n, i] -= row_times(G, i, even)
+    return test
+
+
+@kernel
+def well_known(T_world_left, position, covariance, dof, rows, least, farthest):
+    """Those of the tracks measured `least` times whose depth is `farthest` times its deviation; x/z, y/z, log z (K, 3).
+
+    So they are seen from a pose (4, 4).
+    """
+    known, place, local, k = np.empty(len(rows), np.intp), np.empty((len(rows), 3)), np.empty(3), 0
+    for m in range(len(rows)):
+        n = rows[m]
+        variance = trace(covariance[n])
+        transform_back(T_world_left, position[n], local)
+        if (
+            _count(dof[n]) < least or variance < 0.0 or not local[2] > farthest * np.sqrt(variance)
+        ):  # below 0 by rounding alone
+            continue
+        depth = max(local[2], 1e-9)
+        known[k], place[k, 0], place[k, 1], place[k, 2] = n, local[0] / depth, local[1] / depth, np.log(depth)
+        k += 1
+    return known[:k], place[:k]
 
 
 @kernel
@@ -133,41 +160,37 @@ def displaced(A, p, dof, rows, ages, most_recent, rays, centres, slide):
     which it is seen otherwise [rad]. Displacements (M, 3), their information (M, 3, 3), and lags (M,) [frames].
     """
     d, W, lag = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3)), np.empty(len(rows))
-    now, before, P_now, P_before = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    b_now, b_before = np.empty(3), np.empty(3)
+    total, P, told, age, slots = (
+        np.empty((2, 3, 3)),
+        np.empty((2, 3, 3)),
+        np.empty((2, 3)),
+        np.empty(2),
+        np.empty(2, np.intp),
+    )
     for m in range(len(rows)):
         n = rows[m]
-        count = 0
-        for w in range(A.shape[1]):
-            count += dof[n, w] > 0
-        recent = min(max(count // 2, 2), most_recent)
-        now[:], b_now[:], before[:], b_before[:] = 0.0, 0.0, 0.0, 0.0
-        late = early = 0.0
-        late_slot, early_slot = -1, -1
+        recent = min(max(_count(dof[n]) // 2, 2), most_recent)
+        total[:], told[:], age[:], slots[:] = 0.0, 0.0, 0.0, -1
         for w in range(A.shape[1]):
             if dof[n, w] == 0:
                 continue
-            if ages[w] < recent:
-                _add(now, A[n, w], 1.0)
-                _add_times(b_now, A[n, w], p[n, w], 1.0)
-                late += ages[w] * trace(A[n, w])
-                if late_slot < 0 or ages[w] < ages[late_slot]:
-                    late_slot = w
-            else:
-                _add(before, A[n, w], 1.0)
-                _add_times(b_before, A[n, w], p[n, w], 1.0)
-                early += ages[w] * trace(A[n, w])
-                if early_slot < 0 or ages[w] > ages[early_slot]:
-                    early_slot = w
-        lag[m] = max(early / max(trace(before), LEAST) - late / max(trace(now), LEAST), 1.0)
-        invert_symmetric(now, PART * trace(now) + 1e3 * LEAST, P_now)
-        invert_symmetric(before, PART * trace(before) + 1e3 * LEAST, P_before)
+            side = 0 if ages[w] < recent else 1
+            add(total[side], A[n, w], 1.0)
+            add_times(told[side], A[n, w], p[n, w], 1.0)
+            age[side] += ages[w] * trace(A[n, w])
+            if slots[side] < 0 or (ages[w] < ages[slots[side]]) == (side == 0):
+                slots[side] = w
+        for side in range(2):
+            size = trace(total[side])
+            age[side] /= max(size, LEAST)
+            invert_symmetric(total[side], PART * size + 1e3 * LEAST, P[side])
+        lag[m] = max(age[1] - age[0], 1.0)
         for i in range(3):
-            d[m, i] = row_times(P_now, i, b_now) - row_times(P_before, i, b_before)
-        _add(P_now, P_before, 1.0)
-        if late_slot >= 0 and early_slot >= 0:
-            _add_slide(P_now, rays[m], centres[late_slot], centres[early_slot], slide)
-        invert_symmetric(P_now, 0.0, W[m])
+            d[m, i] = row_times(P[0], i, told[0]) - row_times(P[1], i, told[1])
+        add(P[0], P[1], 1.0)
+        if slots[0] >= 0 and slots[1] >= 0:
+            _add_slide(P[0], rays[m], centres[slots[0]], centres[slots[1]], slide)
+        invert_symmetric(P[0], 0.0, W[m])
     return d, W, lag
 
 
@@ -187,89 +210,18 @@ def _add_slide(P, ray, late, early, slide):
             P[i, j] -= variance * ray[i] * ray[j] / far
 
 
-# ---------------------------------------------------------------------------------------------- windows and bodies
-
-
-@helper
-def _mean(points, A, mean):
-    """Mean of a window's points (W, 3), weighted by their information (W, 3, 3)."""
-    total, P, told = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3)
-    for w in range(len(points)):
-        _add(total, A[w], 1.0)
-        _add_times(told, A[w], points[w], 1.0)
-    invert_symmetric(total, PART * trace(total) + LEAST, P)
-    for i in range(3):
-        mean[i] = row_times(P, i, told)
-
-
-@kernel
-def windows_in_body(A, p, dof, anchor, rows, history, known):
-    """What tracks measured, in the coordinates of a body with poses `history` (W, 4, 4) at the slots `known` (W,).
-
-    Points (M, W, 3), their information (M, W, 3, 3), and whether there is any (M, W).
-    """
-    size = A.shape[1]
-    points, turned = np.empty((len(rows), size, 3)), np.empty((len(rows), size, 3, 3))
-    there = np.empty((len(rows), size), np.bool_)
-    for m in range(len(rows)):
-        n = rows[m]
-        for w in range(size):
-            T, q, o = history[w], p[n, w], anchor[n]
-            away = q[0] + o[0] - T[0, 3], q[1] + o[1] - T[1, 3], q[2] + o[2] - T[2, 3]
-            for i in range(3):
-                points[m, w, i] = row_times(T.T, i, away)
-            there[m, w] = known[w] and dof[n, w] > 0
-            if there[m, w]:
-                turn(T.T, A[n, w], turned[m, w])
-            else:
-                turned[m, w] = 0.0
-    return points, turned, there
-
-
-@kernel
-def weighted_means(points, A):
-    """Means (M, 3) of points by slot (M, W, 3), weighted by their information (M, W, 3, 3)."""
-    means = np.empty((len(points), 3))
-    for m in range(len(points)):
-        _mean(points[m], A[m], means[m])
-    return means
-
-
-@kernel
-def squares(points, A):
-    """χ² (M,) of "one fixed point" for points by slot (M, W, 3) with information (M, W, 3, 3)."""
-    out, mean = np.zeros(len(points)), np.empty(3)
-    for m in range(len(points)):
-        p = points[m]
-        _mean(p, A[m], mean)
-        for w in range(len(p)):
-            out[m] += square(A[m, w], (p[w, 0] - mean[0], p[w, 1] - mean[1], p[w, 2] - mean[2]))
-    return out
-
-
-@kernel
-def distances_from_box(T, lower, upper, position, covariance, rows):
-    """Squared distances (M,), in their own noise, of tracks from the box between two corners in a body's axes T."""
-    out, local, away, gap, P = np.empty(len(rows)), np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
-    for m in range(len(rows)):
-        transform_back(T, position[rows[m]], local)
-        for i in range(3):
-            away[i] = local[i] - min(max(local[i], lower[i]), upper[i])
-        for i in range(3):
-            gap[i] = row_times(T, i, away)
-        invert_symmetric(covariance[rows[m]], RIDGE * trace(covariance[rows[m]]) + LEAST, P)
-        out[m] = square(P, gap)
-    return out
-
-
 # ---------------------------------------------------------------------------------------------- pixels
 
 
 @kernel
-def expected_pixels(camera, T_world_left, position, covariance, rows, sigma):
-    """Pixels (M, 3) at which tracks are expected, NaN behind the camera, and their innovation covariances (M, 3, 3)."""
+def expected_pixels(camera, T_world_left, position, covariance, dof, rows, sigma, sigmas, least, reach):
+    """Pixels (M, 3) at which tracks are expected, NaN behind the camera, and their innovation covariances (M, 3, 3).
+
+    And by how much the right pixel may be off (M,): by so many `sigmas`, and by the first `reach` over the depth [px m]
+    for tracks measured in less than the `least` frames, by the second for others.
+    """
     n = len(rows)
-    z, S, none = np.empty((n, 3)), np.empty((n, 3, 3)), np.zeros(3)
+    z, S, none, allowance = np.empty((n, 3)), np.empty((n, 3, 3)), np.zeros(3), np.empty(n)
     local, J, G = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for m in range(n):
         transform_back(T_world_left, position[rows[m]], local)
@@ -280,41 +232,44 @@ def expected_pixels(camera, T_world_left, position, covariance, rows, sigma):
         turn(G, covariance[rows[m]], S[m])
         for i in range(3):
             S[m, i, i] += sigma * sigma
-    return z, S
+        deviation = np.sqrt(max(S[m, 2, 2], sigma * sigma))  # rounding may leave a covariance that is not definite
+        uneven = reach[0] if _count(dof[rows[m]]) < least else reach[1]
+        allowance[m] = sigmas * deviation + uneven / max(local[2], 1e-3)
+    return z, S, allowance
 
 
 @kernel
-def points_on_rays(camera, T_world_left, points, measured, sigma, far, steps):
-    """Points (N, 3) on the measured rays, their information (N, 3, 3), and numbers measured (N,).
+def measure(camera, T_world_left, position, anchor, measured, rows, slot, sigma, far, steps, A, p, dof):
+    """Enter what tracks measured (M, 3) into a slot of their windows, in place: see `slam.bodies.fits.record`.
 
-    See `slam.bodies.fits.measure`; `camera` (7,) is `slam.geometry.rig.StereoRig.rectified_parameters`, `far`
-    [px] how far off an expected point may be, and `steps` how often it is linearised at most.
+    `camera` (7,) is `slam.geometry.rig.StereoRig.rectified_parameters`, `far` [px] how far off an expected point may
+    be, and `steps` how often it is linearised at most.
     """
     fu, fv, u0, v0, right_fu, _, shift = camera
-    out, A, dof = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3)), np.zeros(len(points), np.int8)
     place, r, J, g = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
-    for n in range(len(points)):
-        x, y = (measured[n, 0] - u0) / fu, (measured[n, 1] - v0) / fv
-        transform_back(T_world_left, points[n], place)
-        met, stereo, front = place[2], not np.isnan(measured[n, 2]), False
+    for m in range(len(rows)):
+        n, z = rows[m], measured[m]
+        x, y = (z[0] - u0) / fu, (z[1] - v0) / fv
+        transform_back(T_world_left, position[n], place)
+        met, stereo, front = place[2], not np.isnan(z[2]), False
         for _ in range(steps):
             depth = met
             place[0], place[1], place[2] = x * depth, y * depth, depth
-            front = residual(camera, place, measured[n], r, J) and r[0] + r[1] == r[0] + r[1]
+            front = residual(camera, place, z, r, J) and r[0] + r[1] == r[0] + r[1]
             if not (front and stereo):
                 break
             met = depth - r[2] * depth * depth / (right_fu * shift)  # on the ray uR changes by f' b / z
             if abs(r[2]) <= far:
                 break
-        if not front:
-            transform(T_world_left, np.zeros(3), out[n])
-            continue
-        place[0], place[1], place[2] = x * met, y * met, met
-        transform(T_world_left, place, out[n])
-        dof[n] = 3 if stereo else 2
-        for k in range(dof[n]):
+        scale = met if front else 0.0
+        place[0], place[1], place[2] = x * scale, y * scale, scale
+        transform(T_world_left, place, p[n, slot])
+        dof[n, slot] = (3 if stereo else 2) if front else 0
+        A[n, slot] = 0.0
+        for i in range(3):
+            p[n, slot, i] -= anchor[n, i]
+        for k in range(dof[n, slot]):
             by_point(J[k], T_world_left, g)
             for i in range(3):
                 for j in range(3):
-                    A[n, i, j] += g[i] * g[j] / (sigma * sigma)
-    return out, A, dof
+                    A[n, slot, i, j] += g[i] * g[j] / (sigma * sigma)

@@ -19,9 +19,13 @@ def windows():
 
 
 def test_constant_velocities_are_least_squares_in_point_and_velocity():
-    A, p, _ = windows()
-    times = np.linspace(-0.5, 0.0, SLOTS)
-    points, P, velocity, PV, test = track_kernels.constant_velocities(A, p, np.arange(TRACKS), times, 0.25)
+    A, p, dof = windows()
+    times, (points, velocity) = np.linspace(-0.5, 0.0, SLOTS), np.zeros((2, TRACKS, 3))
+    P, PV = np.zeros((2, TRACKS, 3, 3))
+    test = track_kernels.fit_tracks(
+        A, p, dof, np.zeros((TRACKS, 3)), np.arange(TRACKS), np.ones(TRACKS, bool), 0, times, 0.25, -np.inf, points, P,
+        velocity, PV,
+    )  # fmt: skip
     for n in range(TRACKS):
         H = np.stack([np.hstack([np.eye(3), t * np.eye(3)]) for t in times])
         normal = np.einsum("wki,wkl,wlj->ij", H, A[n], H) + np.diag([0.0] * 3 + [0.25] * 3)
