@@ -158,7 +158,7 @@ FAULTS = (
     # the front end
     Fault(
         "weight of the mixed derivative in the response", "frontends/surf/localisation.py",
-        "return dxx * dyy - 0.81 * dxy * dxy", "return dxx * dyy - 0.9 * dxy * dxy",
+        "return xx * yy - 0.81 * xy * xy", "return xx * yy - 0.9 * xy * xy",
     ),
     Fault(
         "a quarter of the wavelets of a turned descriptor has the wrong sign", "frontends/surf/descriptor.py",

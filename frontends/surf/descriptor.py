@@ -99,6 +99,7 @@ def _sum_areas(space, weights, descriptors, row):
 def describe(integral, uv, size, angle, excess, weights):
     """Descriptors (N, 16 or 64) float32 of features with pixels (N, 2), sizes (N,) [px], angles (N,) [rad], y down.
 
+    An angle that is NaN counts as 0.
     `integral` is of `integral_image`, `excess` how much wider than cells the boxes are that are averaged, in cells
     (`TURNED_EXCESS` or `UPRIGHT_EXCESS`), `weights` are `gaussian_weights`.
     """
@@ -110,7 +111,7 @@ def describe(integral, uv, size, angle, excess, weights):
     )  # fmt: skip
     pixels = integral.reshape(-1)
     for k in range(len(uv)):
-        width = size[k] * (1.2 / 9.0)
-        _average_cells(pixels, integral.shape, uv[k, 0], uv[k, 1], width, angle[k], (1.0 + excess) * width, space)
+        width, turn = size[k] * (1.2 / 9.0), (0.0 if np.isnan(angle[k]) else angle[k])
+        _average_cells(pixels, integral.shape, uv[k, 0], uv[k, 1], width, turn, (1.0 + excess) * width, space)
         _sum_areas(space, weights, out, k)
     return out

@@ -39,18 +39,20 @@ class HalfImage(NamedTuple):
 
 
 @vector_helper
-def _halve(grey, scale, y, columns, pixels, half, between):
-    """Two rows of an image as float32 pixels and, brought to 0..255, as row y at half resolution."""
-    to, last, quarter = np.uint64(y * columns), grey.shape[1] - 1, np.float32(0.25) * scale
-    for x in range(grey.shape[1]):
-        pixels[2 * y, x], pixels[2 * y + 1, x] = np.float32(grey[2 * y, x]), np.float32(grey[2 * y + 1, x])
+def _halve(grey, scale, y, columns, pixels, pairs, half, between):
+    """Two rows of a flat image as float32 pixels and, brought to 0..255, as row y at half resolution."""
+    width, to, quarter = pairs.size - 1, np.uint64(y * columns), np.float32(0.25) * scale
+    upper, lower, one, two = np.uint64(2 * y * width), np.uint64((2 * y + 1) * width), np.uint64(1), np.uint64(2)
+    for x in range(width):
+        k = np.uint64(x)
+        a, b = np.float32(grey[upper + k]), np.float32(grey[lower + k])
+        pixels[upper + k], pixels[lower + k] = a, b
+        pairs[k] = a + b
+    pairs[width] = pairs[width - 1]
     for x in range(columns):
-        a, b = pixels[2 * y, 2 * x] + pixels[2 * y, 2 * x + 1], pixels[2 * y + 1, 2 * x] + pixels[2 * y + 1, 2 * x + 1]
-        half[to + np.uint64(x)] = quarter * (a + b)
-    for x in range(columns):
-        k, right = 2 * x + 1, min(2 * x + 2, last)
-        a, b = pixels[2 * y, k] + pixels[2 * y, right], pixels[2 * y + 1, k] + pixels[2 * y + 1, right]
-        between[to + np.uint64(x)] = quarter * (a + b)
+        k = two * np.uint64(x)
+        half[to + np.uint64(x)] = quarter * (pairs[k] + pairs[k + one])
+        between[to + np.uint64(x)] = quarter * (pairs[k + one] + pairs[k + two])
 
 
 @vector_helper
@@ -86,18 +88,18 @@ def float_images(grey, scale):
     An odd last row or column is left out there.
     """
     rows, columns = grey.shape[0] // 2, grey.shape[1] // 2
-    pixels, size = np.empty(grey.shape, np.float32), rows * columns + _LANES
+    pixels, size = np.empty(grey.size, np.float32), rows * columns + _LANES
     half, weight, between = np.zeros(size, np.float32), np.zeros(size, np.float32), np.zeros(size, np.float32)
     sums, squares = np.empty(columns, np.float32), np.empty(columns, np.float32)
+    flat, pairs = grey.reshape(-1), np.empty(grey.shape[1] + 1, np.float32)
     for y in range(rows):
-        _halve(grey, scale, y, columns, pixels, half, between)
-    for y in range(2 * rows, grey.shape[0]):
-        for x in range(grey.shape[1]):
-            pixels[y, x] = np.float32(grey[y, x])
+        _halve(flat, scale, y, columns, pixels, pairs, half, between)
+    for k in range(2 * rows * grey.shape[1], grey.size):
+        pixels[k] = np.float32(flat[k])
     for y in range(_HALF, rows - _HALF):
         _column_sums(half, y, columns, sums, squares)
         _row_weights(sums, squares, y, columns, weight)
-    return pixels, (rows, columns), half, weight, between
+    return pixels.reshape(grey.shape), (rows, columns), half, weight, between
 
 
 @vector_helper

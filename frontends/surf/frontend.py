@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from frontends.surf.config import SurfConfig
 from frontends.surf.correlation import align, cut_patches, patch_windows
 from frontends.surf.epipolar import ROW, search_rows
-from frontends.surf.images import Picture, following_white, grey
+from frontends.surf.images import Picture, Sampler, following_white, grey
 from frontends.surf.keypoints import Keypoints, adapted_threshold, spread
 from frontends.surf.surf import Surf
 from slam.bounds import from_options
@@ -46,7 +46,8 @@ class SurfFrontend:
         self.rig = rig
         self.config = c = from_options(SurfConfig, "surf", options)
         self._surf = Surf(c.threshold, c.octaves, c.layers, c.descriptor, c.upright, c.threads)
-        self._maps = () if rig.is_rectified else rig.rectified.maps  # made here: the first frame must not wait for them
+        maps = () if rig.is_rectified else rig.rectified.maps  # made here: the first frame must not wait for them
+        self._samplers = [Sampler(places) for places in maps]
         self._threshold = float(np.clip(c.threshold, *_THRESHOLDS))
         self._white = 0.0
         self._windows = np.stack([patch_windows(0.4), patch_windows(0.3)])  # a wide and a narrow one
@@ -66,18 +67,22 @@ class SurfFrontend:
         keypoints, threshold = self._detect(left)
         keypoints = self._spread(keypoints, int(_CHOICE * self.config.features))
         keypoints = self._spread(self._surf.localise(left, keypoints), self.config.features)
-        uv, size = keypoints.uv, keypoints.size
+        order = np.argsort(keypoints.uv[:, 1])  # cost: the rows that one feature needs are in the cache for the next
+        uv, size = keypoints.uv[order], keypoints.size[order]
 
         def describe_and_match(first: int, last: int) -> tuple[NDArray, ...]:
             """Angles, descriptors and right pixels of some of the features."""
-            here = uv[first:last]
-            matched = self._match(left, right[0], here, size[first:last]) if right else np.full_like(here, np.nan)
-            return *self._surf.described(left.integral, keypoints, first, last), matched
+            here = uv[first:last], size[first:last]
+            matched = self._match(left, right[0], *here) if right else np.full_like(here[0], np.nan)
+            return *self._surf.described(left.integral, *here), matched
 
-        angle, descriptors, uv_right = self._surf.workers.over(len(uv), describe_and_match)
+        by_response = np.empty_like(order)
+        by_response[order] = np.arange(len(order))
+        found = self._surf.workers.over(len(order), describe_and_match)
+        angle, descriptors, uv_right = (column[by_response] for column in found)
         features = StereoFeatures(
-            frame.stamp, uv, uv_right, size, np.zeros(len(uv)) if self.config.upright else angle, keypoints.response,
-            keypoints.laplacian, descriptors, threshold,
+            frame.stamp, keypoints.uv, uv_right, keypoints.size, np.zeros(len(uv)) if self.config.upright else angle,
+            keypoints.response, keypoints.laplacian, descriptors, threshold,
             ImagePair(left.floats[0], right[0].floats[0] if right else None), rectified=True,
         )  # fmt: skip
         return features if np.isfinite(angle).all() else features.select(np.isfinite(angle))
@@ -113,18 +118,13 @@ class SurfFrontend:
 
     def _picture(self, image: NDArray, side: int, white: float) -> Picture:
         """The image of the left (0) or right (1) camera, rectified, with what is needed of it."""
-        picture = Picture(self._rectify(image, side), white)
+        picture = Picture(self._rectified(image, side), white)
         _ = picture.floats
         return picture
 
-    def _rectify(self, image: NDArray, side: int) -> NDArray:
+    def _rectified(self, image: NDArray, side: int) -> NDArray:
         """Image of the rectified rig's left (0) or right (1) camera."""
-        if not self._maps:
-            return image
-        import cv2
-
-        columns, rows = self._maps[side]
-        return cv2.remap(image, columns, rows, cv2.INTER_LINEAR)
+        return self._samplers[side](image) if self._samplers else image
 
     def _rectified_mask(self, mask: NDArray | None) -> NDArray | None:
         if mask is None:
@@ -132,7 +132,7 @@ class SurfFrontend:
         if mask.shape != (self.rig.height, self.rig.width):
             size = "x".join(str(n) for n in mask.shape[::-1])
             raise SequenceError(f"mask: {size}, but the images are {self.rig.width}x{self.rig.height}")
-        return self._rectify((mask != 0).astype(np.uint8), 0)
+        return self._rectified((mask != 0).astype(np.uint8), 0)
 
     def _detect(self, picture: Picture) -> tuple[Keypoints, float]:
         """Features, and the D_threshold that found them: lowered at once where it finds less than half (A, III.A)."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from frontends.surf.epipolar import HalfImage, float_images
 from slam.errors import SequenceError
 from slam.grey_range import grey_range
+from slam.runtime.compilation import disjoint_vector_helper, kernel
 
 _FALL = 0.98  # of the grey value that counts as white, from image to image
 
@@ -45,6 +46,47 @@ class Picture:
         return integral_image(self.grey)
 
 
+class Sampler:
+    """Images (H, W) at fixed places, interpolated linearly: as ``cv2.remap`` with zero outside, in a third of the time.
+
+    Args:
+        places: columns and rows (2, H, W) float32 of each sample.
+    """
+
+    def __init__(self, places: NDArray[np.float32]) -> None:
+        ends = np.array(places.shape[:0:-1], np.float32)[:, None, None]  # there all four neighbours are zero
+        places = np.clip(places, -1.0, ends)
+        columns, rows = whole = np.floor(places)
+        self._at = ((rows + 1.0).astype(np.int32) * (places.shape[2] + 3) + (columns + 1.0).astype(np.int32)).ravel()
+        self._right, self._down = (places - whole).reshape(2, -1)
+
+    def __call__(self, image: NDArray) -> NDArray:
+        """The image (H, W), uint8 or uint16, at these places."""
+        height, width = image.shape
+        padded = np.zeros((height + 3, width + 3), image.dtype)
+        padded[1:-2, 1:-2] = image
+        return sampled(padded, self._at, self._right, self._down).reshape(height, width)
+
+
+@disjoint_vector_helper
+def _interpolate(pixels, stride, at, right, down, out):
+    s, one = np.uint64(stride), np.uint64(1)
+    for j in range(len(at)):
+        k = np.uint64(at[j])
+        a, b = np.float32(pixels[k]), np.float32(pixels[k + one])
+        c, d = np.float32(pixels[k + s]), np.float32(pixels[k + s + one])
+        upper, lower = a + right[j] * (b - a), c + right[j] * (d - c)
+        out[j] = np.int32(np.rint(upper + down[j] * (lower - upper)))
+
+
+@kernel
+def sampled(image, at, right, down):
+    """An image's grey values (N,), interpolated beside and below places in the flat image (N,) by fractions (N,)."""
+    out = np.empty(len(at), image.dtype)
+    _interpolate(image.reshape(-1), image.shape[1], at, right, down, out)
+    return out
+
+
 def grey(image: NDArray, what: str = "image") -> NDArray:
     """A grey image (H, W), C-contiguous, from one in grey, BGR or BGRA of any layout.
 
@@ -76,15 +118,17 @@ def grey(image: NDArray, what: str = "image") -> NDArray:
 def integral_image(image: NDArray) -> NDArray[np.int32]:
     """Integral image (H+1, W+1) int32 of a grey image (H, W): ``sum(y, x) = image[:y, :x].sum()``.
 
-    Sums wrap around modulo 2**32. Differences of them stay exact as long as one box sum fits 31 bits, which it does
-    for every filter size in use, also with 16-bit pixels.
+    A 16-bit image is first freed of its mean, which no filter sees, but which would cost single-precision sums of small
+    contrasts their last digits. Sums wrap around modulo 2**32. Differences of them stay exact as long as one box sum
+    fits 31 bits, which it does for every filter size in use.
     """
     if not image.size:
         return np.zeros((image.shape[0] + 1, image.shape[1] + 1), np.int32)
     import cv2
 
     if image.dtype != np.uint8:  # exact below 2**53
-        return cv2.integral(image, sdepth=cv2.CV_64F).astype(np.int64).astype(np.int32)
+        centred = image - np.rint(image.mean()).astype(np.float32)
+        return cv2.integral(centred, sdepth=cv2.CV_64F).astype(np.int64).astype(np.int32)
     return cv2.integral(image, sdepth=cv2.CV_32S)
 
 

@@ -20,87 +20,113 @@ _CONVERGED = 0.05  # numerics: in units of the steps
 _LANES = 8  # cost: columns are read in whole vector registers
 _WIDEST = 2.6  # cost: bound of the columns that the filters of a feature read, in units of its size
 
+#: Where the filters' ten corners are on each axis, in units of the size from the centre, and padding.
+_CORNERS = np.concatenate([np.arange(10) / 9.0 - 0.5, np.zeros(6)]).astype(np.float32)
 #: Horizontal part of the filters: which of the three vertical parts is read at the ten columns of corners, and weights.
 _PART = np.array([0, 2, 1, 0, 2, 2, 0, 1, 2, 0])
-_WEIGHT = np.array([-1.0, -1.0, -1.0, 3.0, 1.0, 1.0, -3.0, 1.0, -1.0, 1.0])
+_WEIGHT = np.array([-1.0, -1.0, -1.0, 3.0, 1.0, 1.0, -3.0, 1.0, -1.0, 1.0], np.float32)
 
 
 @vector_helper
-def _sums(p, corners):
-    """Vertical part of the filters for Dxx, Dyy and Dxy on whole rows: sums of all that is left of ten corners."""
-    a0, a1, a2, a3, a4, a5, a6, a7, a8, a9 = corners
-    whole, lobe = np.int32(p[a9] - p[a0]), np.int32(p[a6] - p[a3])
-    xy = np.int32(np.int32(p[a4] - p[a1]) - np.int32(p[a8] - p[a5]))
-    return np.int32(p[a7] - p[a2]), np.int32(whole - np.int32(3) * lobe), xy
+def _place(centre, size, whole, rest, to):
+    """Pixels of a filter's corners along one axis, and the fractions beyond them."""
+    for k in range(_CORNERS.size):
+        v, j = centre + size * _CORNERS[k], np.uint64(to + k)
+        whole[j] = np.int32(v)
+        rest[j] = v - np.float32(whole[j])
 
 
 @vector_helper
-def _part(p, at, stride, part):
-    """Part of a row of the image, summed up to a pixel corner."""
-    return part * np.int32(p[at + stride] - p[at])
+def _beyond(p, at, stride, first):
+    """Sum of a row of the image up to a pixel corner, without that up to the first of the columns."""
+    return np.float32(np.int32(np.int32(p[at + stride] - p[at]) - first))
 
 
 @disjoint_vector_helper
-def _vertical_parts(p, s, a, f, n, out, lanes):
-    """Vertical part of the filters for Dxx, Dyy and Dxy, from the lines at the ten rows of corners, on n columns.
-
-    Whole rows count from the first of the columns, so that none of their sums wraps around.
-    """
-    a0, a1, a2, a3, a4, a5, a6, a7, a8, a9 = a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8], a[9]
-    f0, f1, f2, f3, f4, f5, f6, f7, f8, f9 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9]
-    first_xx, first_yy, first_xy = _sums(p, (a0, a1, a2, a3, a4, a5, a6, a7, a8, a9))
+def _between_two(p, stride, a, b, f, g, n, out, to):
+    """Vertical part of a filter on n columns: sums from a line, at a and a fraction f of a row, to another."""
+    rows = np.int32(p[b] - p[a])
+    above, below = np.int32(p[a + stride] - p[a]), np.int32(p[b + stride] - p[b])
     for j in range(n):
         k = np.uint64(j)
-        xx, yy, xy = _sums(p, (a0 + k, a1 + k, a2 + k, a3 + k, a4 + k, a5 + k, a6 + k, a7 + k, a8 + k, a9 + k))
-        whole, lobe = (
-            _part(p, a9 + k, s, f9) - _part(p, a0 + k, s, f0),
-            _part(p, a6 + k, s, f6) - _part(p, a3 + k, s, f3),
-        )
-        upper = _part(p, a4 + k, s, f4) - _part(p, a1 + k, s, f1)
-        lower = _part(p, a8 + k, s, f8) - _part(p, a5 + k, s, f5)
-        out[k] = np.int32(xx - first_xx) + (_part(p, a7 + k, s, f7) - _part(p, a2 + k, s, f2))
-        out[lanes + k] = np.int32(yy - first_yy) + (whole - 3.0 * lobe)
-        out[lanes + lanes + k] = np.int32(xy - first_xy) + (upper - lower)
+        between = np.float32(np.int32(np.int32(p[b + k] - p[a + k]) - rows))
+        out[to + k] = between + (g * _beyond(p, b + k, stride, below) - f * _beyond(p, a + k, stride, above))
+
+
+@disjoint_vector_helper
+def _between_four(p, stride, a, b, c, d, f, g, h, i, weight, n, out, to):
+    """The same: sums from the first line to the fourth, less those from the second to the third by their weight."""
+    outer, inner = np.int32(p[d] - p[a]), np.int32(p[c] - p[b])
+    first, second = np.int32(p[a + stride] - p[a]), np.int32(p[b + stride] - p[b])
+    third, fourth = np.int32(p[c + stride] - p[c]), np.int32(p[d + stride] - p[d])
+    for j in range(n):
+        k = np.uint64(j)
+        whole = np.float32(np.int32(np.int32(p[d + k] - p[a + k]) - outer))
+        lobe = np.float32(np.int32(np.int32(p[c + k] - p[b + k]) - inner))
+        whole += i * _beyond(p, d + k, stride, fourth) - f * _beyond(p, a + k, stride, first)
+        lobe += h * _beyond(p, c + k, stride, third) - g * _beyond(p, b + k, stride, second)
+        out[to + k] = whole - weight * lobe
 
 
 @vector_helper
-def _response(parts, lanes, x, size):
-    """Determinant of the Hessian of the filter with its centre at a column of the vertical parts."""
-    dxx, dyy, dxy = 0.0, 0.0, 0.0
+def _response(parts, lanes, whole, rest, to, size):
+    """Determinant of the Hessian of the filter with its corners at columns of the vertical parts."""
+    dxx, dyy, dxy = np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for k in range(10):
-        u = x + size * (k / 9.0 - 0.5)
-        column = np.int64(u)
-        at = np.uint64(_PART[k] * lanes + column)
-        value = _WEIGHT[k] * (parts[at] + (u - column) * (parts[at + np.uint64(1)] - parts[at]))
+        j = np.uint64(to + k)
+        at = np.uint64(_PART[k] * lanes + whole[j])
+        value = _WEIGHT[k] * (parts[at] + rest[j] * (parts[at + np.uint64(1)] - parts[at]))
         if _PART[k] == 0:
             dxx += value
         elif _PART[k] == 1:
             dyy += value
         else:
             dxy += value
-    area = size * size
-    dxx, dyy, dxy = dxx * 5.4 / area, dyy * 5.4 / area, dxy * 9.0 / area
-    return dxx * dyy - 0.81 * dxy * dxy
+    scale = 1.0 / (size * size)
+    xx, yy, xy = dxx * (5.4 * scale), dyy * (5.4 * scale), dxy * (9.0 * scale)
+    return xx * yy - 0.81 * xy * xy
 
 
 @helper
 def _responses(pixels, stride, x, y, size, step, wide, space, out):
     """Responses of a filter at (x, y) and, if `wide`, `step` to its left and right; it must lie inside the image.
 
-    The vertical part of the filters is common to the three.
+    The vertical part of the filters is common to the three. Sums count from the first of the columns: none wraps
+    around, and float32 holds them.
     """
-    corners, fractions, parts = space
-    lanes = parts.size // 3
-    half = 0.5 * size + (step if wide else 0.0)
-    first = np.int64(x + 0.5 - half)
-    n = (np.int64(x + 0.5 + half) + 1 + _LANES - first) & -_LANES
-    for k in range(10):
-        v = y + 0.5 + size * (k / 9.0 - 0.5)
-        whole = np.int64(v)
-        corners[k], fractions[k] = np.uint64(whole * stride + first), v - whole
-    _vertical_parts(pixels, np.uint64(stride), corners, fractions, n, parts, np.uint64(lanes))
+    whole, rest, parts = space
+    lanes, s, most = parts.size // 3, np.uint64(stride), _CORNERS.size
+    half, reach = 0.5 * size, (step if wide else 0.0)
+    left, top = np.int64(x + 0.5 - half - reach), np.int64(y + 0.5 - half)
+    narrow = np.float32(size)
+    _place(np.float32(y + 0.5 - top), narrow, whole, rest, 0)
     for j in range(0 if wide else 1, 3 if wide else 2):
-        out[j] = _response(parts, lanes, x + 0.5 - first + (j - 1) * step, size)
+        _place(np.float32(x + 0.5 - left + (j - 1) * step), narrow, whole, rest, (j + 1) * most)
+    first, last = (most if wide else 2 * most), (3 * most if wide else 2 * most)
+    at = top * stride + left
+    # Dxx
+    n = (whole[last + 9] + 1 + _LANES) & -_LANES
+    a, b = np.uint64(at + whole[2] * stride), np.uint64(at + whole[7] * stride)
+    _between_two(pixels, s, a, b, rest[2], rest[7], n, parts, np.uint64(0))
+    # Dyy
+    skip = np.int64(whole[first + 2])
+    n = (whole[last + 7] - skip + 1 + _LANES) & -_LANES
+    a, b = np.uint64(at + skip + whole[0] * stride), np.uint64(at + skip + whole[3] * stride)
+    c, d = np.uint64(at + skip + whole[6] * stride), np.uint64(at + skip + whole[9] * stride)
+    _between_four(
+        pixels, s, a, b, c, d, rest[0], rest[3], rest[6], rest[9], np.float32(3.0), n, parts, np.uint64(lanes + skip)
+    )
+    # Dxy
+    skip = np.int64(whole[first + 1])
+    n = (whole[last + 8] - skip + 1 + _LANES) & -_LANES
+    a, b = np.uint64(at + skip + whole[1] * stride), np.uint64(at + skip + whole[5] * stride)
+    c, d = np.uint64(at + skip + whole[8] * stride), np.uint64(at + skip + whole[4] * stride)
+    _between_four(
+        pixels, s, a, b, c, d, rest[1], rest[5], rest[8], rest[4], np.float32(1.0), n, parts,
+        np.uint64(2 * lanes + skip),
+    )  # fmt: skip
+    for j in range(0 if wide else 1, 3 if wide else 2):
+        out[j] = _response(parts, lanes, whole, rest, (j + 1) * most, size)
 
 
 @helper
@@ -150,7 +176,8 @@ def localise(integral, uv, size, reach):
     for i in range(len(size)):
         largest = max(largest, size[i])
     lanes = int(_WIDEST * largest) + 2 * _LANES
-    space = np.empty(10, np.uint64), np.empty(10), np.empty(3 * lanes)  # corners of a filter, and its vertical parts
+    corners = 4 * _CORNERS.size  # of a filter: rows, and columns of three places
+    space = np.empty(corners, np.int32), np.empty(corners, np.float32), np.empty(3 * lanes, np.float32)
     cube, curvature, step = np.empty((3, 3, 3)), np.empty((3, 3)), np.empty(3)
     pixels = integral.reshape(-1)
     rows, stride = integral.shape

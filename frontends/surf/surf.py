@@ -112,8 +112,11 @@ class Surf:
         if not len(keypoints):
             return keypoints
         picture = Picture.of(image)
-        integral, uv, size = picture.integral, keypoints.uv, keypoints.size
-        (place,) = self.workers.over(len(uv), lambda a, b: (localise(integral, uv[a:b], size[a:b], _REACH),))
+        order = np.argsort(keypoints.uv[:, 1])  # cost: the rows that one feature needs are in the cache for the next
+        integral, uv, size = picture.integral, keypoints.uv[order], keypoints.size[order]
+        (found,) = self.workers.over(len(uv), lambda a, b: (localise(integral, uv[a:b], size[a:b], _REACH),))
+        place = np.empty_like(found)
+        place[order] = found
         rows = np.flatnonzero(np.isfinite(place[:, 0]))
         rows = rows[np.argsort(-place[rows, 3], kind="stable")]
         rows = rows[first_of_each(np.argsort(place[rows, 0], kind="stable"), place[rows, :2], place[rows, 2])]
@@ -125,19 +128,19 @@ class Surf:
 
         Returns the features and their unit descriptors (N, 16 or 64) float32.
         """
-        work = partial(self.described, Picture.of(image).integral, keypoints)
-        angle, descriptors = self.workers.over(len(keypoints), work)
+        integral, uv, size = Picture.of(image).integral, keypoints.uv, keypoints.size
+        angle, descriptors = self.workers.over(len(uv), lambda a, b: self.described(integral, uv[a:b], size[a:b]))
         good = np.isfinite(angle)
         return replace(keypoints, angle=angle).select(good), descriptors[good]
 
     def described(
-        self, integral: NDArray[np.int32], keypoints: Keypoints, first: int, last: int
+        self, integral: NDArray[np.int32], uv: NDArray[np.float64], size: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Angles, NaN where there is none, and descriptors of the features from `first` to before `last`."""
-        uv, size, upright = keypoints.uv[first:last], keypoints.size[first:last], self.config.upright
-        angle = np.full(last - first, UPRIGHT_ANGLE) if upright else orientations(integral, uv, size)
+        """Angles, NaN where there is none, and descriptors of features with pixels (N, 2) and sizes (N,) [px]."""
+        upright = self.config.upright
+        angle = np.full(len(uv), UPRIGHT_ANGLE) if upright else orientations(integral, uv, size)
         excess = UPRIGHT_EXCESS if upright else TURNED_EXCESS
-        return angle, describe(integral, uv, size, np.nan_to_num(angle), excess, self._weights)
+        return angle, describe(integral, uv, size, angle, excess, self._weights)
 
     def detect_and_describe(self, image: NDArray, mask: NDArray | None = None) -> tuple[Keypoints, NDArray[np.float32]]:
         """`detect` and `describe` in one."""

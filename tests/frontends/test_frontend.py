@@ -9,6 +9,7 @@ import pytest
 
 import frontends
 from frontends.surf import SurfFrontend
+from frontends.surf.images import Sampler
 from frontends.surf.keypoints import adapted_threshold, spread
 from slam.data import StereoFrame
 from slam.errors import SequenceError
@@ -27,6 +28,18 @@ def bytes_of(features):
         features.descriptors,
     )  # fmt: skip
     return b"".join(a.tobytes() for a in arrays) + np.float64(features.threshold).tobytes()
+
+
+@pytest.mark.parametrize("white", [255, 65535])
+def test_images_are_sampled_linearly_with_zero_outside(white):
+    rng = np.random.default_rng(3)
+    image = rng.integers(0, white + 1, (24, 40)).astype(np.min_scalar_type(white))
+    x, y = rng.uniform(-3.0, 43.0, (24, 40)), rng.uniform(-3.0, 27.0, (24, 40))
+    x[0, :3], y[0, :3] = (-1.0, 39.0, 40.0), (5.0, 23.0, 24.0)
+    padded, left, top = np.pad(image.astype(float), 4), np.floor(x).astype(int), np.floor(y).astype(int)
+    corners = [(1 - np.abs(x - left - i)) * (1 - np.abs(y - top - k)) * padded[top + 4 + k, left + 4 + i]
+               for i in (0, 1) for k in (0, 1)]  # fmt: skip
+    np.testing.assert_allclose(Sampler(np.float32([x, y]))(image), sum(corners), atol=0.5 + 1e-4 * white)
 
 
 def test_fields():
