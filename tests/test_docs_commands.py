@@ -41,9 +41,7 @@ SHORTER = {"--trials": "1", "--seeds": "1"}
 #: Options that are added to a command; runs leave pictures on README alone.
 ADDED = {"demo": ["--frames", "10"], "compare": ["--workers", "1", "--trials", "1"], "view": ["--to", "shown.rrd"]}
 WITHOUT_PICTURE = ("run", "replay")
-README = list(commands(PAGES[0], *SHELLS))
-#: Pages whose commands are not all on README.
-SHOWING = [page for page in PAGES[1:] if any(words not in README for words in commands(page, *SHELLS))]
+README = PAGES[0]
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +98,14 @@ def needs_rerun(words):
     return "--viewer" in words or words[:2] == ["slam", "view"]
 
 
-@pytest.mark.parametrize("page", [PAGES[0], *SHOWING], ids=lambda page: page.stem)
+def run_on(page):
+    """Words of the commands of a page that are run: of README all, of the others what README does not show."""
+    shown = (words for words in commands(page, *SHELLS) if words[0] not in OF_THE_PACKAGE)
+    at_hand = [words for words in shown if not any(NOT_AT_HAND.search(word) for word in words)]
+    return [words for words in at_hand if page == README or words not in run_on(README)]
+
+
+@pytest.mark.parametrize("page", filter(run_on, PAGES), ids=lambda page: page.stem)
 def test_commands_run(page, reader, tmp_path, monkeypatch):
     shutil.copytree(reader, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
@@ -108,16 +113,11 @@ def test_commands_run(page, reader, tmp_path, monkeypatch):
     if page.name == "objects.md":  # the database that its Python saves
         (code,) = [block for block in blocks(page, "python") if "ObjectDatabase" in block]
         exec(compile(code, page.name, "exec", dont_inherit=True), {})
-    for words in commands(page, *SHELLS):
-        if words[0] in OF_THE_PACKAGE:
-            continue
-        if any(NOT_AT_HAND.search(word) for word in words):
-            continue
-        words = shortened(words)
+    for words in map(shortened, run_on(page)):
         if needs_rerun(words) and importlib.util.find_spec("rerun") is None:
             continue
         if words[0] == "slam":
-            words += ["--no-picture"] if words[1] in WITHOUT_PICTURE and page is not PAGES[0] else []
+            words += ["--no-picture"] if words[1] in WITHOUT_PICTURE and page != README else []
             command(*words[1:], status=int(words[1] == "calibrate"))  # so few frames do not tell how good a rig is
         else:
             done = in_a_process(words, tmp_path)

@@ -58,6 +58,7 @@ def noisy(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.clip(image + np.rint(rng.normal(0, 1, image.shape)), 0, 255).astype(np.uint8)
 
 
+@pytest.mark.slow
 def test_frames_that_a_video_doubles_are_no_stop():
     """They are compressed anew, so bytes differ; a car at 8 m/s does not stop, and go on, from frame to frame."""
     street, rng = slam.open_sequence("synthetic:street?frames=14"), np.random.default_rng(0)

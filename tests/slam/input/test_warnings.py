@@ -270,6 +270,7 @@ def test_a_right_image_that_stays_is_not_used():
     assert any("frame 3: the right image is that of the frame before: its camera froze" in w for w in system.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("world", "late"), [("aisle?frames=120", (0, -1, 2)), ("desk?frames=72", (0, 1))])
 def test_right_images_of_another_moment_are_doubted(world, late):
     """Numbers off by one: the run is tracked, with another scale."""

@@ -61,6 +61,7 @@ def test_a_usual_mistake_of_the_truth_is_named_and_alone(poses, late, words):
     assert said.count("; and ") == (words.startswith("turned by"))
 
 
+@pytest.mark.slow
 def test_what_the_truth_s_own_errors_explain_is_no_mistake_of_it():
     """Positions by satellites, off by as much as the camera moves in a second, and by little of the way; rotations."""
     rng, t = np.random.default_rng(2), np.arange(0.0, 120.0, 0.5)
