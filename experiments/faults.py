@@ -50,7 +50,7 @@ class Fault:
 
 def faults(quick: bool) -> list[Fault]:
     """The recordings; frame numbers are in the recording, after any are dropped."""
-    n, dark = (24, 20) if quick else (120, 60)
+    n, dark = (18, 14) if quick else (120, 60)
     rng = np.random.default_rng(0)  # frame 0 keeps its right image: without it there is no map that could be kept
     chosen = ",".join(str(k) for k in range(1, 2 * n) if rng.random() < 0.3)
     every = [
@@ -58,7 +58,7 @@ def faults(quick: bool) -> list[Fault]:
         Fault(f"{dark / 30:.2g} s of blackout", f"frames={2 * n + dark}&black={n}:{n + dark}", n - 1, n + dark),
         Fault("30 % of frames dropped", f"frames={2 * n}&drop=0.3", n // 2, n // 2 + 1),
         Fault("30 % of right images dropped", f"frames={2 * n}&dropright={chosen}", n, n + 1),
-        Fault("kidnapped to a known place", "frames=900", n - 1, n, (n, 12 if quick else 30)),
+        Fault("kidnapped to a known place", "frames=900", n - 1, n, (n, 2 if quick else 30)),
         Fault("kidnapped to an unknown place", "frames=900", n - 1, n, (n, 450)),
     ]
     return [every[1], every[3], every[4]] if quick else every
@@ -133,7 +133,7 @@ def main() -> int:
     arguments = parser.parse_args()
     rows, errors = [], {}
     for fault in faults(arguments.quick):
-        features = extract(fault, 48 if arguments.quick else 300)
+        features = extract(fault, 42 if arguments.quick else 300)
         for backend in ONLINE:
             row, errors[fault, backend] = run(fault, backend, features)
             rows.append(row)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -133,7 +134,7 @@ def place_rows(sequence: Any, true: Any, poses: dict[int, Any], backend: str, mo
 
 def moving(quick: bool, out: Path) -> list[dict[str, Any]]:
     """The box under a moving camera: with, and without the box's features."""
-    name, frames = "box?density=300&camera=moving&seed=0", 90 if quick else 10**6
+    name, frames = "box?density=300&camera=moving&seed=0", 80 if quick else 10**6
     rows, scores = [], {}
     for backend in BACKENDS:
         row, scores[backend] = scored_run(name, backend, frames)
@@ -171,9 +172,9 @@ def boxes(quick: bool, out: Path) -> list[dict[str, Any]]:
 def occlusion(quick: bool, out: Path) -> list[dict[str, Any]]:
     """The box is hidden: how often it keeps its id, of ten runs."""
     found: dict[tuple[str, int], list[tuple[set[int], set[int], int]]] = {}
-    for seed in range(1 if quick else 10):
-        for backend, frames in [(b, h) for h in HIDDEN_FOR for b in BACKENDS][: 1 if quick else None]:
-            found.setdefault((backend, frames), []).append(ids_about(seed, backend, frames))
+    hidden_for, backends = (HIDDEN_FOR[:1], BACKENDS[:1]) if quick else (HIDDEN_FOR, BACKENDS)
+    for seed, frames, backend in product(range(1 if quick else 10), hidden_for, backends):
+        found.setdefault((backend, frames), []).append(ids_about(seed, backend, frames, max(hidden_for)))
     return [
         {
             "back end": backend, "hidden [s]": frames / 30, "runs": len(runs),
@@ -185,13 +186,16 @@ def occlusion(quick: bool, out: Path) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def ids_about(seed: int, backend: str, frames: int) -> tuple[set[int], set[int], int]:
-    """Ids measured before the box is hidden for so many frames, and soon after; frames until it is found."""
+def ids_about(seed: int, backend: str, frames: int, longest: int) -> tuple[set[int], set[int], int]:
+    """Ids measured before the box is hidden for so many frames, and soon after; frames until it is found.
+
+    Features are found once for all that are hidden for up to `longest` frames.
+    """
     name, back = f"box?density=300&camera=moving&seed={seed}", HIDDEN_AT + frames
     sequence = slam.open_sequence(f"synthetic:{name}")
     system = system_for(sequence, backend, [])
     before, after, delay = set(), set(), WATCHED_AFTER
-    seen = seen_in(name, HIDDEN_AT + max(HIDDEN_FOR) + WATCHED_AFTER, WATCHED_FROM)
+    seen = seen_in(name, HIDDEN_AT + longest + WATCHED_AFTER, WATCHED_FROM)
     for k, (features, labels) in enumerate(seen[: back + WATCHED_AFTER - WATCHED_FROM], WATCHED_FROM):
         shown = features.select(labels == 0) if HIDDEN_AT <= k < back else features
         ids = {thing.id for thing in system.process_features(shown).objects if thing.estimate.measured}
@@ -204,14 +208,14 @@ def ids_about(seed: int, backend: str, frames: int) -> tuple[set[int], set[int],
 
 def still(quick: bool, out: Path) -> list[dict[str, Any]]:
     """Nothing moves: whatever is found is wrong. Medians over ten seeds."""
-    seeds, frames = (1, 15) if quick else (10, 100)
+    seeds, frames = (1, 8) if quick else (10, 100)
     worlds = ("aisle?speed=2&", "desk?density=200&", "street?cars=0&")
     return [scored_run(f"{w}seed={seed}", "ekf", frames)[0] for w in worlds for seed in range(seeds)]
 
 
 def people(quick: bool, out: Path) -> list[dict[str, Any]]:
     """Cyclists and walkers: nothing in the detector was chosen on this world."""
-    return [scored_run("people?", backend, 20 if quick else 10**6)[0] for backend in BACKENDS]
+    return [scored_run("people?", backend, 8 if quick else 10**6)[0] for backend in BACKENDS]
 
 
 def kitti(quick: bool, out: Path) -> list[dict[str, Any]]:

@@ -152,11 +152,11 @@ def draw(runs: list[StartUp], path: Path) -> None:
 
 
 def main() -> int:
-    parser = script_options(__file__, __doc__, "30 frames instead of 150")
+    parser = script_options(__file__, __doc__, "15 frames instead of 150")
     arguments = parser.parse_args()
     sequence = open_sequence("synthetic:startup")
     assert isinstance(sequence, WorldSequence)
-    known, frames = stored_map(sequence), 30 if arguments.quick else 150
+    known, frames = stored_map(sequence), 15 if arguments.quick else 150
     cases = [(pixels, backend, start) for pixels in ("stereo", "left", ALONE) for backend in ONLINE for start in STARTS]
     runs = [start_up(sequence, known, backend, start, frames, pixels) for pixels, backend, start in cases]
     print(f"{len(known)} stored features, {frames} frames; of three wrong starts the worst. ", end="")

@@ -26,8 +26,9 @@ FEW = 4  # frames
 SHELLS = ("sh", "shell", "bash")  # consoles have tests of their own
 #: First words of what installs, tests or builds the package itself: `.ci/run` does all of it.
 OF_THE_PACKAGE = {"git", "cd", "pip", "pytest", "ruff", "mypy", "mkdocs", "pre-commit", "python3", ".", ".ci/run"}
-#: A camera, recordings of ROS, and timings.
-NOT_AT_HAND = re.compile(r"^camera:|\.(bag|mcap|db3)(\?|$)|^walk_folder$|^benchmarks/")
+#: A camera and recordings of ROS, which tests/slam/sequences plays and writes; timings; kernels are compiled by .ci/run
+#: and tests/slam/runtime.
+NOT_AT_HAND = re.compile(r"^camera:|\.(bag|mcap|db3)(\?|$)|^walk_folder$|^benchmarks/|^warm-up$")
 #: What the page shows, and what is run in its place.
 STAND_INS = {
     "path/to/kitti_or_euroc_folder": "euroc",
@@ -37,6 +38,10 @@ STAND_INS = {
 }
 #: Options that get another value.
 SHORTER = {"--trials": "1", "--seeds": "1"}
+#: Options that are added to a command; runs leave pictures on README alone.
+ADDED = {"demo": ["--frames", "10"], "compare": ["--workers", "1", "--trials", "1"], "view": ["--to", "shown.rrd"]}
+WITHOUT_PICTURE = ("run", "replay")
+README = PAGES[0]
 
 
 @pytest.fixture(scope="module")
@@ -86,15 +91,21 @@ def shortened(words):
             if "frames=" not in word and "--frames" not in words:
                 word += f"{'&' if '?' in word else '?'}frames={FEW}"
         out.append(SHORTER.get(option) or word)
-    added = {"demo": ["--frames", "10"], "compare": ["--workers", "1", "--trials", "1"], "view": ["--to", "shown.rrd"]}
-    return out + (added.get(out[1], []) if out[0] == "slam" else [])
+    return out + (ADDED.get(out[1], []) if out[0] == "slam" else [])
 
 
 def needs_rerun(words):
     return "--viewer" in words or words[:2] == ["slam", "view"]
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if list(commands(page, *SHELLS))], ids=lambda page: page.stem)
+def run_on(page):
+    """Words of the commands of a page that are run: of README all, of the others what README does not show."""
+    shown = (words for words in commands(page, *SHELLS) if words[0] not in OF_THE_PACKAGE)
+    at_hand = [words for words in shown if not any(NOT_AT_HAND.search(word) for word in words)]
+    return [words for words in at_hand if page == README or words not in run_on(README)]
+
+
+@pytest.mark.parametrize("page", filter(run_on, PAGES), ids=lambda page: page.stem)
 def test_commands_run(page, reader, tmp_path, monkeypatch):
     shutil.copytree(reader, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
@@ -102,15 +113,11 @@ def test_commands_run(page, reader, tmp_path, monkeypatch):
     if page.name == "objects.md":  # the database that its Python saves
         (code,) = [block for block in blocks(page, "python") if "ObjectDatabase" in block]
         exec(compile(code, page.name, "exec", dont_inherit=True), {})
-    for words in commands(page, *SHELLS):
-        if words[0] in OF_THE_PACKAGE:
-            continue
-        if any(NOT_AT_HAND.search(word) for word in words):
-            continue  # tests/slam/sequences plays the device and writes such recordings; benchmarks take minutes
-        words = shortened(words)
+    for words in map(shortened, run_on(page)):
         if needs_rerun(words) and importlib.util.find_spec("rerun") is None:
             continue
         if words[0] == "slam":
+            words += ["--no-picture"] if words[1] in WITHOUT_PICTURE and page != README else []
             command(*words[1:], status=int(words[1] == "calibrate"))  # so few frames do not tell how good a rig is
         else:
             done = in_a_process(words, tmp_path)

@@ -8,6 +8,8 @@ most is shared by the landmarks of a step.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.io import loadmat
@@ -31,6 +33,7 @@ def measured(raw, width, height):
     return StereoRig.rectified_pair(f, u0, v0, b, width, height), raw["t"][0], pixels
 
 
+@cache
 def drive(folder):
     """Rig, stamps, true T_world_left (K, 4, 4) by GPS, and pixels of the drive."""
     rig, stamps, pixels = measured(loadmat(folder / f"{FILE}_sync_KLT.mat"), 1226, 370)

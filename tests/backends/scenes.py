@@ -37,23 +37,30 @@ def path(frames: int, dt: float, velocity: Array, rate: Array) -> Array:
     return chained([se3.exp(dt * np.concatenate([rate, velocity]))] * (frames - 1))
 
 
-def random_path(frames: int, dt: float, velocity: Array, motion: MotionModel, rng: np.random.Generator) -> Array:
-    """Poses (F, 4, 4) whose velocities walk randomly as `motion` says: world velocity, and body rate."""
+def random_path(
+    frames: int, dt: float, velocity: Array, motion: MotionModel, rng: np.random.Generator, kept: float = 1.0
+) -> Array:
+    """Poses (F, 4, 4) whose velocities walk randomly as `motion` says: world velocity, and body rate.
+
+    Of the rate a share is `kept` from frame to frame.
+    """
     T, v, w = np.eye(4), np.array(velocity, float), np.zeros(3)
     poses = [T]
     sigma_v, sigma_w = np.sqrt(motion.velocity_variance(dt))
     for _ in range(frames - 1):
-        v, w = v + sigma_v * rng.standard_normal(3), w + sigma_w * rng.standard_normal(3)
+        v, w = v + sigma_v * rng.standard_normal(3), kept * w + sigma_w * rng.standard_normal(3)
         T = se3.pose(T[:3, :3] @ se3.so3_exp(w * dt), T[:3, 3] + v * dt)
         poses.append(T)
     return np.array(poses)
 
 
-def cloud(poses: Array, count: int, rng: np.random.Generator, near: float = 3.0, far: float = 12.0) -> Array:
+def cloud(
+    poses: Array, count: int, rng: np.random.Generator, near: float = 3.0, far: float = 12.0, rig: StereoRig = RIG
+) -> Array:
     """`count` points (N, 3) in the world, each in view of a pose drawn from `poses`, between two depths [m]."""
     depth = rng.uniform(near, far, count)
-    uv = rng.uniform((0, 0), (RIG.width - 1, RIG.height - 1), (count, 2))
-    rays = np.concatenate([RIG.left.normalise(uv), np.ones((count, 1))], axis=1) * depth[:, None]
+    uv = rng.uniform((0, 0), (rig.width - 1, rig.height - 1), (count, 2))
+    rays = np.concatenate([rig.left.normalise(uv), np.ones((count, 1))], axis=1) * depth[:, None]
     chosen = poses[rng.integers(len(poses), size=count)]
     return np.einsum("nij,nj->ni", chosen[:, :3, :3], rays) + chosen[:, :3, 3]
 

@@ -13,7 +13,7 @@ import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,6 +47,7 @@ class Subject(NamedTuple):
     name: str
     case: Case  # makes one of a random generator, in an empty folder, and gives it to the program
     quiet: bool = True  # whether Python's warnings count as broken promises
+    runs: bool = True  # whether kernels are called
     short: int = 60  # number of cases in the tests
 
 
@@ -71,8 +72,9 @@ def run_case(subject: Subject, number: int) -> str:
     return ""
 
 
+@cache
 def warm_up() -> None:
-    """Have the kernels compiled, which takes longer than any case may: a short run of both back ends."""
+    """Have the kernels compiled, which takes longer than any case may: a short run of both back ends, once."""
     world = slam.open_sequence("synthetic:box?frames=90&density=300")
     for backend in ("ekf", "smoother"):
         observed, shown = StereoSlam(world.rig, None, backend), StereoSlam(world.rig, "surf", backend)
@@ -82,7 +84,7 @@ def warm_up() -> None:
             shown.process(frame)
 
 
-@lru_cache(maxsize=1)
+@cache
 def scene() -> tuple[StereoRig, tuple[StereoFeatures, ...]]:
     """A rig and what it sees of a small world, frame by frame."""
     world = slam.open_sequence("synthetic:desk?frames=5&density=6&seed=1")

@@ -148,4 +148,8 @@ def read_bag(rng: np.random.Generator, folder: Path) -> None:
     consume(str(whole if rng.random() < 0.6 else alone[0]))
 
 
-SUBJECTS = (Subject("folders", read_folder), Subject("paths", read_path), Subject("bags", read_bag, quiet=False))
+SUBJECTS = (
+    Subject("folders", read_folder, runs=False),
+    Subject("paths", read_path, runs=False),
+    Subject("bags", read_bag, quiet=False, runs=False),
+)

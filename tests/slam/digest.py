@@ -1,4 +1,4 @@
-"""What a short run comes to, as a digest; ``python -m tests.slam.digest`` prints those of all back ends as JSON."""
+"""A short run and its digest; ``python -m tests.slam.digest`` prints those of all back ends as JSON."""
 
 from __future__ import annotations
 
@@ -7,17 +7,25 @@ import json
 import sys
 import threading
 from collections.abc import Iterable
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 import slam
 from slam.config import SystemConfig
+from slam.data import StereoFeatures
 from slam.system import StereoSlam
 
-WORLD = "synthetic:box?density=300&frames=100"
+SEQUENCE = slam.open_sequence("synthetic:box?density=300&frames=100")
 FIRST = 58  # the box moves, and is found some thirty frames later
 BACKENDS = ("ekf", "smoother")
+
+
+@cache
+def seen(k: int) -> StereoFeatures:
+    """Features of the k-th frame of the run."""
+    return SEQUENCE.observations(FIRST + k)
 
 
 def digest_of(arrays: Iterable[Any]) -> str:
@@ -37,15 +45,14 @@ def state(system: StereoSlam) -> str:
 
 def run(backend: str, frames: int, images: int, threads: int) -> dict[str, str]:
     """Digests of a run on observations, and of one on images."""
-    sequence = slam.open_sequence(WORLD)
-    seen = StereoSlam(sequence.rig, None, backend)
-    results = [seen.process_features(sequence.observations(FIRST + k)) for k in range(frames)]
+    told = StereoSlam(SEQUENCE.rig, None, backend)
+    results = [told.process_features(seen(k)) for k in range(frames)]
     bodies = [body.estimate.T_world_object for result in results for body in result.objects]
-    config = SystemConfig.for_kind(sequence.kind).with_settings([f"frontend.threads={threads}"])
-    shown = StereoSlam(sequence.rig, "surf", backend, config=config)
-    for frame in sequence.frames(FIRST, FIRST + images):
+    config = SystemConfig.for_kind(SEQUENCE.kind).with_settings([f"frontend.threads={threads}"])
+    shown = StereoSlam(SEQUENCE.rig, "surf", backend, config=config)
+    for frame in SEQUENCE.frames(FIRST, FIRST + images):
         shown.process(frame)
-    return {"observations": state(seen), "images": state(shown), "bodies": digest_of(bodies), "count": str(len(bodies))}
+    return {"observations": state(told), "images": state(shown), "bodies": digest_of(bodies), "count": str(len(bodies))}
 
 
 def main() -> None:

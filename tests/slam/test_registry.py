@@ -35,6 +35,7 @@ def test_a_folder_that_hides_ours_is_named(folder, role, name):
     assert f"{folder / role} hides slam's own `{role}`: rename it" in said
 
 
+@pytest.mark.slow
 def test_python_m_slam_is_not_hidden_and_finds_a_package_in_the_folder(folder):
     run = ("-m", "slam", "run", "synthetic:desk?frames=3", "--out", "out", "--frontend", "nothing", "--backend")
     assert "unknown front end 'nothing'" in _said(folder, *run, "ekf")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,14 +13,18 @@ from slam.data import FrameStatus, StereoFrame
 from slam.input.warnings import REPEATED
 
 SEQUENCE = slam.open_sequence("synthetic:desk?frames=20")
-FRAMES = list(SEQUENCE)
 FROZEN = [*range(12), *[11] * 7, *range(12, 20)]
 BACKENDS = ("ekf", "smoother")
 
 
-def shown(order: list[int], frames: list[StereoFrame] = FRAMES) -> list[StereoFrame]:
+@cache
+def frames() -> list[StereoFrame]:
+    return list(SEQUENCE)
+
+
+def shown(order: list[int], given: list[StereoFrame] | None = None) -> list[StereoFrame]:
     """These frames, one after the other."""
-    return [replace(frames[k], index=j, stamp=j / 30) for j, k in enumerate(order)]
+    return [replace((given or frames())[k], index=j, stamp=j / 30) for j, k in enumerate(order)]
 
 
 def system(backend: str = "ekf") -> slam.StereoSlam:
@@ -53,6 +58,7 @@ def noisy(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.clip(image + np.rint(rng.normal(0, 1, image.shape)), 0, 255).astype(np.uint8)
 
 
+@pytest.mark.slow
 def test_frames_that_a_video_doubles_are_no_stop():
     """They are compressed anew, so bytes differ; a car at 8 m/s does not stop, and go on, from frame to frame."""
     street, rng = slam.open_sequence("synthetic:street?frames=14"), np.random.default_rng(0)
@@ -69,8 +75,8 @@ def test_frames_that_a_video_doubles_are_no_stop():
 
 
 def test_a_camera_that_stands_still_is_tracked_by_its_noise():
-    rng, last = np.random.default_rng(0), FRAMES[5]
+    rng, last = np.random.default_rng(0), frames()[5]
     still = [StereoFrame(0, 0.0, noisy(last.left, rng), noisy(last.right, rng)) for _ in range(6)]
     s = system()
-    results = [s.process(frame) for frame in shown(list(range(12)), [*FRAMES[:6], *still])]
+    results = [s.process(frame) for frame in shown(list(range(12)), [*frames()[:6], *still])]
     assert {r.status for r in results[1:]} == {FrameStatus.TRACKED} and s.warnings == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -34,12 +35,13 @@ def some_map(count=20, dimensions=16):
     )  # fmt: skip
 
 
-def first_run(backend, frames=25, cloud=None):
-    system = StereoSlam(RIG, None, backend, config=CONFIG)
-    cloud = cloud or Cloud(150)
-    for k, T in enumerate(path(frames)):
+@cache
+def first_map(backend: str) -> SavedMap:
+    """The map of a first run."""
+    system, cloud = StereoSlam(RIG, None, backend, config=CONFIG), Cloud(150)
+    for k, T in enumerate(path(25)):
         system.process_features(cloud.features(T, k / 30, 0.3)[0])
-    return system
+    return system.snapshot()
 
 
 # --- the file ---
@@ -152,8 +154,7 @@ def test_what_cannot_be_is_refused(name: str, value: np.ndarray):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_second_run_elsewhere_in_the_map_is_in_the_maps_world(backend):
-    cloud = Cloud(150)
-    known = first_run(backend, cloud=cloud).snapshot()
+    cloud, known = Cloud(150), first_map(backend)
     start = se3.exp(np.array([0.02, -0.15, 0.05, -0.3, 0.1, 0.4]))
     system = StereoSlam(RIG, None, backend, config=CONFIG, prior_map=known)
     assert system.snapshot() is known
@@ -173,7 +174,7 @@ def test_a_second_run_elsewhere_in_the_map_is_in_the_maps_world(backend):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_where_nothing_is_known_the_camera_stays_lost_and_the_map_as_it_is(backend):
-    known = first_run(backend).snapshot()
+    known = first_map(backend)
     system, elsewhere = StereoSlam(RIG, None, backend, config=CONFIG, prior_map=known), Cloud(150, seed=9)
     for k, T in enumerate(path(8)):
         result = system.process_features(elsewhere.features(T, k / 30, 0.3)[0])
@@ -190,7 +191,7 @@ def test_there_is_no_map_before_the_first_frame_and_an_empty_one_is_refused():
 
 
 def test_descriptors_of_another_kind_are_refused():
-    known = first_run("ekf").snapshot()
+    known = first_map("ekf")
     system = StereoSlam(RIG, None, "ekf", config=CONFIG, prior_map=known)
     assert system.process_features(StereoFeatures.empty(0.0, 64)).status is FrameStatus.LOST  # nothing to see
     features, _ = Cloud(60, dimensions=64).features(np.eye(4), 1.0)
@@ -210,7 +211,7 @@ def test_descriptors_of_another_kind_are_refused():
     ],
 )
 def test_a_map_of_another_rig_is_refused(focal, baseline, width, said):
-    known = decode(encode(first_run("ekf").snapshot()), "a.map")
+    known = decode(encode(first_map("ekf")), "a.map")
     K = RIG.left.K * [[focal], [focal], [1]]
     size = RIG.width * width, RIG.height
     rig = StereoRig.from_pinhole(K, baseline=RIG.baseline * baseline, size=size)
@@ -222,7 +223,7 @@ def test_a_map_of_another_rig_is_refused(focal, baseline, width, said):
 
 
 def test_a_prior_map_that_is_larger_than_the_limit_is_kept():
-    known = first_run("ekf").snapshot()
+    known = first_map("ekf")
     small = replace(CONFIG, map=replace(CONFIG.map, target_in_view=10, max_landmarks=10))
     system = StereoSlam(RIG, None, "ekf", config=small, prior_map=known)
     assert system.config.map.max_landmarks == len(known) > 10

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from slam.geometry.se3 import Array
 from slam.models import EstimatorModels, MotionModel, models_for
 from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.third_party import OnlinePose, recent_of
+from tests.backends.scenes import cloud, random_path
 
 SIGMA = 0.7
 HANDHELD = StereoRig.rectified_pair(260.0, 159.5, 119.5, 0.12, 320, 240)
@@ -34,10 +35,8 @@ class BodyScene:
         dt: time between frames [s].
         camera: poses T_world_left (F, 4, 4), the first the identity.
         body: motion of the body (F, 4, 4) since frame 0, in world coordinates, the first the identity.
-        velocity: angular velocity and velocity of the origin (F, 6) in world axes in the interval before each frame.
         points: of the body at frame 0, in world coordinates (P, 3).
         landmarks: of the still world (N, 3).
-        stamps: times (F,) [s].
     """
 
     rig: StereoRig
@@ -47,7 +46,11 @@ class BodyScene:
     body: Array
     points: Array
     landmarks: Array
-    stamps: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def stamps(self) -> Array:
+        """Times (F,) [s]."""
+        return self.dt * np.arange(len(self.camera))
 
     def background(self, k: int, rng: np.random.Generator, limit: int = 60) -> Observations:
         """Landmarks in frame k."""
@@ -97,27 +100,6 @@ def box_points(count: int, size: Array, centre: Array, rng: np.random.Generator)
     return centre + unit * size
 
 
-def camera_path(frames: int, dt: float, velocity: Array, motion: MotionModel, rng: np.random.Generator) -> Array:
-    """Poses (F, 4, 4) from the identity; velocities walk randomly but little, as `motion` says."""
-    T, v, w = np.eye(4), np.array(velocity, float), np.zeros(3)
-    sigma_v, sigma_w = np.sqrt(motion.velocity_variance(dt))
-    out = [T]
-    for _ in range(frames - 1):
-        v, w = v + sigma_v * rng.standard_normal(3), 0.9 * w + sigma_w * rng.standard_normal(3)
-        T = se3.pose(T[:3, :3] @ se3.so3_exp(w * dt), T[:3, 3] + v * dt)
-        out.append(T)
-    return np.array(out)
-
-
-def cloud(rig: StereoRig, poses: Array, count: int, near: float, far: float, rng: np.random.Generator) -> Array:
-    """Still points (N, 3), each in view of a pose drawn from `poses`, between two depths [m]."""
-    depth = rng.uniform(near, far, count)
-    uv = rng.uniform((0, 0), (rig.width - 1, rig.height - 1), (count, 2))
-    rays = np.concatenate([rig.left.normalise(uv), np.ones((count, 1))], axis=1) * depth[:, None]
-    chosen = poses[rng.integers(len(poses), size=count)]
-    return np.einsum("nij,nj->ni", chosen[:, :3, :3], rays) + chosen[:, :3, 3]
-
-
 def box_scene(
     seed: int = 0, frames: int = 30, moving: bool = True, distance: float = 1.0, points: int = 25,
     body: Array | None = None, still: bool = False,
@@ -127,7 +109,7 @@ def box_scene(
     models, dt, centre = replace(models_for("handheld"), pixel_sigma=SIGMA), 1 / 30, np.array([0.0, 0.0, distance])
     motion = MotionModel(0.1, 0.1)
     camera = (
-        camera_path(frames, dt, np.array([0.1, 0.02, 0.0]), motion, rng)
+        random_path(frames, dt, np.array([0.1, 0.02, 0.0]), motion, rng, 0.9)
         if moving
         else np.tile(np.eye(4), (frames, 1, 1))
     )
@@ -138,23 +120,19 @@ def box_scene(
     if still:
         body = np.tile(np.eye(4), (frames, 1, 1))
     shape = box_points(points, np.full(3, 0.3), centre, rng)
-    return BodyScene(
-        HANDHELD, models, dt, camera, body, shape, cloud(HANDHELD, camera, 120, 1.0, 4.0, rng), dt * np.arange(frames)
-    )
+    return BodyScene(HANDHELD, models, dt, camera, body, shape, cloud(camera, 120, rng, 1.0, 4.0, HANDHELD))
 
 
 def car_scene(seed: int = 0, frames: int = 30, distance: float = 15.0, points: int = 30) -> BodyScene:
     """A car ahead of a driving one at 10 Hz, both at 8 m/s or so."""
     rng = np.random.default_rng([seed, 6])
     models, dt, centre = replace(models_for("driving"), pixel_sigma=SIGMA), 0.1, np.array([1.0, 0.5, distance])
-    camera = camera_path(frames, dt, np.array([0, 0, 8.0]), MotionModel(0.5, 0.05), rng)
+    camera = random_path(frames, dt, np.array([0, 0, 8.0]), MotionModel(0.5, 0.05), rng, 0.9)
     o = models.objects
     start = np.array([0, 0, 0, 0, 0, 8.0])
     body = random_motion(frames, dt, start, (o.acceleration, o.angular_acceleration), rng, centre)
     shape = box_points(points, np.array([1.7, 1.4, 4.0]), centre, rng)
-    return BodyScene(
-        KITTI, models, dt, camera, body, shape, cloud(KITTI, camera, 250, 5.0, 50.0, rng), dt * np.arange(frames)
-    )
+    return BodyScene(KITTI, models, dt, camera, body, shape, cloud(camera, 250, rng, 5.0, 50.0, KITTI))
 
 
 Rule = Callable[[int, ObjectObservations], "ObjectObservations | None"]

@@ -13,12 +13,13 @@ from slam.bodies.config import ObjectsConfig
 from slam.bodies.estimator import BodyEstimator
 from slam.bodies.following import found_again, located
 from slam.bodies.frame import Frame, Setup
-from slam.data import RecentPoses, StereoFeatures
+from slam.data import RecentPoses
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp, transform
 from slam.models import models_for
 from slam.object_data import ObjectObservations
 from slam.tracks.table import Tracks
+from tests.slam.scene import features_at
 
 RIG = StereoRig.rectified_pair(700.0, 620, 188, 0.54, 1241, 376)
 WINDOW = 12
@@ -40,10 +41,7 @@ def scene(seen, off, rng, deviation=0.5):
     truth = T @ exp(off)
     uv, uv_right = RIG.project(transform(truth, POINTS[:seen]))
     noise = 0.3 * rng.standard_normal((seen, 3))
-    features = StereoFeatures(
-        0.0, uv + noise[:, :2], uv_right + noise[:, [2, 1]], np.ones(seen), np.zeros(seen), np.ones(seen),
-        np.ones(seen, np.int8), np.eye(seen, 64, dtype=np.float32),
-    )  # fmt: skip
+    features = features_at(uv + noise[:, :2], uv_right + noise[:, [2, 1]], np.eye(seen, 64, dtype=np.float32))
     tracks = Tracks.empty(64, WINDOW)
     rows = begin(tracks, features, np.arange(seen), transform(T, POINTS[:seen]))
     body = new_body(1, T[:3, 3], np.zeros(6), np.zeros(WINDOW), 0.0, 2.0)

@@ -7,11 +7,12 @@ import numpy as np
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.detector import MovingObjectDetector
 from slam.bodies.fits import constant_velocity, revise_tracks
-from slam.data import Estimate, StereoFeatures
+from slam.data import Estimate
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import inverse, transform
 from slam.models import models_for
 from slam.tracks.table import Tracks
+from tests.slam.scene import features_at
 
 RIG = StereoRig.rectified_pair(700.0, 620, 188, 0.54, 1241, 376)
 CHANGE = 0.4  # of all disparities [px]
@@ -25,14 +26,12 @@ def mend(z):
     return z - np.array([0.0, 0.0, CHANGE])
 
 
-def features_at(T, points, k):
+def seen(T, points, k):
     """What a rig sees whose disparities are too small before the change, and right after it."""
     uv, uv_right = RIG.project(transform(inverse(T), points))
     if k < AT:
         uv_right = uv_right + np.array([CHANGE, 0.0])
-    n = len(points)
-    one = np.ones(n)
-    return StereoFeatures(DT * k, uv, uv_right, one, 0 * one, one, np.ones(n, np.int8), np.eye(n, 64, dtype=np.float32))
+    return features_at(uv, uv_right, np.eye(len(points), 64, dtype=np.float32), DT * k)
 
 
 def velocities(revised):
@@ -46,7 +45,7 @@ def velocities(revised):
         T[2, 3] = 0.8 * k
         if k == AT and revised:
             detector.revise(tracks, mend)
-        features = features_at(T, points, k)
+        features = seen(T, points, k)
         estimate = Estimate(features.stamp, T, 1e-6 * np.eye(6), *NO_LANDMARKS)
         tracks = tracks.begun(len(points), detector.window)
         detector.step(None, tracks, features, estimate)
@@ -64,7 +63,7 @@ def test_a_point_whose_disparity_is_rounded_off_stays_where_it_is():
     """It ended a run: nothing says how far it moves as its disparity is corrected."""
     points, first = np.array([[0.0, 0.0, 40.0], [1.0, 0.0, 1e20]]), np.arange(2)
     tracks = Tracks.empty(64, 12)
-    tracks.begin(first, first, features_at(np.eye(4), points, AT), points)
+    tracks.begin(first, first, seen(np.eye(4), points, AT), points)
     revise_tracks(tracks, {}, np.tile(np.eye(4), (12, 1, 1)), 0, RIG, mend)
     assert abs(tracks.position[0, 2] - 40.0) > 1.0
     assert np.array_equal(tracks.position[1], points[1])

@@ -8,19 +8,17 @@ from functools import cache
 
 import pytest
 
-import slam
 from slam.errors import SlamError
 from slam.system import StereoSlam
-from tests.slam.digest import FIRST, WORLD, state
+from tests.slam.digest import SEQUENCE, seen, state
 
-SEQUENCE = slam.open_sequence(WORLD)
 FRAMES = 14
 
 
 def run(backend: str) -> str:
     system = StereoSlam(SEQUENCE.rig, None, backend)
     for k in range(FRAMES):
-        system.process_features(SEQUENCE.observations(FIRST + k))
+        system.process_features(seen(k))
     return state(system)
 
 
@@ -54,7 +52,7 @@ def test_two_systems_in_two_threads_give_the_same_bytes_as_alone(names):
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])
 def test_one_system_used_from_two_threads_says_so_and_goes_on(backend, monkeypatch):
     system = StereoSlam(SEQUENCE.rig, None, backend)
-    system.process_features(SEQUENCE.observations(FIRST))
+    system.process_features(seen(0))
     entered, go, predict = threading.Event(), threading.Event(), system.backend.predict
 
     def waiting(stamp):
@@ -63,11 +61,11 @@ def test_one_system_used_from_two_threads_says_so_and_goes_on(backend, monkeypat
         return predict(stamp)
 
     monkeypatch.setattr(system.backend, "predict", waiting)
-    thread = threading.Thread(target=lambda: system.process_features(SEQUENCE.observations(FIRST + 1)))
+    thread = threading.Thread(target=lambda: system.process_features(seen(1)))
     thread.start()
     assert entered.wait(60)
     calls = [
-        lambda: system.process_features(SEQUENCE.observations(FIRST + 2)), system.estimate, system.snapshot,
+        lambda: system.process_features(seen(2)), system.estimate, system.snapshot,
         system.trajectory, lambda: pickle.dumps(system),
     ]  # fmt: skip
     try:
@@ -79,5 +77,5 @@ def test_one_system_used_from_two_threads_says_so_and_goes_on(backend, monkeypat
         thread.join()
     monkeypatch.undo()
     for k in range(2, FRAMES):
-        system.process_features(SEQUENCE.observations(FIRST + k))
+        system.process_features(seen(k))
     assert state(system) == alone(backend)

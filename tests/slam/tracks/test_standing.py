@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import slam
+from frontends import create
 from slam.chi_square import chi_square_limit
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
@@ -161,14 +162,21 @@ def test_what_fills_the_view_of_a_standing_vehicle_does_not_take_it_along(backen
     assert results[35].estimate.covariance[3, 3] > 1.0 > 1e-3 > results[-1].estimate.covariance[3, 3]
 
 
+@pytest.fixture(scope="module")
+def street(slam_data):
+    """A still camera before people who walk by: the sequence, and the features of its frames."""
+    sequence = slam.open_sequence(f"{slam_data / 'still_camera_people'}?calibration=calib.txt&fps=30")
+    frontend = create("surf", sequence.rig, **SystemConfig.for_kind(sequence.kind).frontend)
+    return sequence, [frontend.extract(frame) for frame in sequence]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
-def test_people_who_walk_by_hardly_move_the_camera(slam_data, backend):
+def test_people_who_walk_by_hardly_move_the_camera(street, backend):
     """Two people are in view at most; their shadows, through which the ground is seen, are no bodies."""
-    folder = slam_data / "still_camera_people"
-    sequence = slam.open_sequence(f"{folder}?calibration=calib.txt&fps=30")
+    sequence, seen = street
     system = slam.StereoSlam(sequence.rig, backend=backend, kind=sequence.kind)
-    results = [system.process(frame) for frame in sequence]
+    results = [system.process_features(features) for features in seen]
     assert {result.status.value for result in results} == {"started", "tracked"}
     assert max(len(result.objects) for result in results) <= 3
     errors = np.array([log(result.estimate.T_world_left) for result in results])
