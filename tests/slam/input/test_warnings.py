@@ -47,7 +47,7 @@ def lines(frames, features=200, rig=RIG, kind="handheld", stereo=90, **arrays):
     return watch.lines
 
 
-def Stamped(stamps, change=lambda left, right: (left, right)):
+def stamped(stamps, change=lambda left, right: (left, right)):
     """The frame at these times, with its images changed."""
     left, right = change(FRAME.left, FRAME.right)
     return [replace(FRAME, index=k, stamp=stamp, left=left, right=right) for k, stamp in enumerate(stamps)]
@@ -55,7 +55,7 @@ def Stamped(stamps, change=lambda left, right: (left, right)):
 
 def every(count, change=lambda left, right: (left, right), interval=0.05):
     """So many frames at 20 Hz."""
-    return Stamped(interval * np.arange(count), change)
+    return stamped(interval * np.arange(count), change)
 
 
 def swap(left, right):
@@ -163,9 +163,9 @@ SAID = {
     "slow": (every(20, interval=2.0), {}, "frames are 2 s apart: in that time a camera can turn so far"),
     "1 kHz": (every(8, interval=0.001), {}, ""),
     "2 Hz": (every(8, interval=0.5), {}, ""),
-    "a gap": (Stamped([0, 0.1, 0.2, 40.0, 40.1, 40.2, 40.3]), {}, ""),
+    "a gap": (stamped([0, 0.1, 0.2, 40.0, 40.1, 40.2, 40.3]), {}, ""),
     "an hour": (
-        Stamped(0.1 * np.arange(20) + 3600.0 * (np.arange(20) > 9) + 7200.0 * (np.arange(20) > 15)), {},
+        stamped(0.1 * np.arange(20) + 3600.0 * (np.arange(20) > 9) + 7200.0 * (np.arange(20) > 15)), {},
         "^frame 10: its stamp is 3600 s after that of the frame before: if the clock was set there",
     ),
     "an hour at the start": (
@@ -238,7 +238,7 @@ def test_cameras_that_are_exchanged_for_certain_are_refused():
     for rig in (RIG, of_size(1.2)):  # also where a principal point is far from the middle
         with pytest.raises(SequenceError, match=r"left and right look swapped: .* exchange them"):
             lines(every(8, swap), stereo=3, rig=rig)
-    right_before = [*Stamped([0.0, 0.1]), *itertools.islice(every(8, swap), 3, None)]
+    right_before = [*stamped([0.0, 0.1]), *itertools.islice(every(8, swap), 3, None)]
     assert len(lines(right_before, stereo=3)) <= 1
 
 
