@@ -1,7 +1,6 @@
-"""Compiled passes of bodies: what tracks say of one, its members, and from its motion to its pose and back.
+"""Compiled passes of bodies over the table of tracks: what tracks say of one, and where its members are.
 
-Windows of tracks are as in `slam.bodies.track_kernels`. Poses X are T_world_left, Y T_body_left; a velocity (6,) is
-[ω, v] in world axes.
+Windows of tracks are as in `slam.bodies.track_kernels`.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ import numpy as np
 
 from slam.bodies.track_kernels import LEAST, PART, RIDGE, add, add_times
 from slam.kernels.linear import invert_symmetric, row_times, square, trace, turn
-from slam.kernels.se3 import adjoint, between, exp, point_by_motion, rotation_vector, transform, transform_back
+from slam.kernels.se3 import point_by_motion, transform, transform_back
 from slam.runtime.compilation import helper, kernel
 
 # ---------------------------------------------------------------------------------------------- windows and bodies
@@ -144,71 +143,3 @@ def distances_from_box(T, lower, upper, position, covariance, rows):
         invert_symmetric(covariance[rows[m]], RIDGE * trace(covariance[rows[m]]) + LEAST, P)
         out[m] = square(P, gap)
     return out
-
-
-# ---------------------------------------------------------------------------------------------- poses
-
-
-@helper
-def _of_camera(X, Y, out):
-    """The body's pose ``X Y⁻¹`` (4, 4)."""
-    for i in range(3):
-        out[i, 3] = X[i, 3]
-        for j in range(3):
-            out[i, j] = row_times(X, i, Y[j])
-            out[i, 3] -= out[i, j] * Y[j, 3]
-        out[3, i] = 0.0
-    out[3, 3] = 1.0
-
-
-@kernel
-def predicted_camera(Y, X, velocity, dt):
-    """The camera's next pose in a body (4, 4) by the body's velocity (6,), and by the camera's poses X (2, 4, 4).
-
-    And its derivatives (6, 6) by an impulse on the velocity, in the camera's axes and in the world's.
-    """
-    T, step, change, back = np.empty((4, 4)), np.zeros(6), np.empty((3, 4)), np.empty((3, 4))
-    moved, after, A, M = np.empty((3, 4)), np.zeros((4, 4)), np.empty((6, 6)), np.empty((6, 6))
-    _of_camera(X[0], Y, T)
-    for i in range(3):
-        step[i] = dt * velocity[i]
-    exp(step, change)
-    for i in range(3):
-        moved[i, 3] = T[i, 3] + dt * velocity[3 + i]
-        for j in range(3):
-            moved[i, j] = row_times(T.T, j, change[i])
-    between(moved, X[1], after)
-    after[3, 3] = 1.0
-    between(X[1], moved, back)
-    adjoint(back, A)
-    for i in range(6):
-        for j in range(6):
-            A[i, j] *= dt
-        for j in range(6):
-            k = j - j % 3
-            M[i, j] = A[i, k] * moved[j % 3, 0] + A[i, k + 1] * moved[j % 3, 1] + A[i, k + 2] * moved[j % 3, 2]
-    return after, A, M
-
-
-@kernel
-def motion_in_world(X, Y, dt):
-    """The body's poses (2, 4, 4) by the camera's in the world and in the body (2, 4, 4), `dt` [s] apart.
-
-    And its velocity (6,), with derivatives (6, 12) by these poses.
-    """
-    T, R, J = np.empty((2, 4, 4)), np.empty((3, 3)), np.zeros((6, 12))
-    velocity, inverse_J = np.empty(6), np.empty((3, 3))
-    for k in range(2):
-        _of_camera(X[k], Y[k], T[k])
-    for i in range(3):
-        for j in range(3):
-            R[i, j] = row_times(T[1], i, T[0, j])
-    rotation_vector(R, velocity, inverse_J)
-    for i in range(3):
-        velocity[i] /= dt
-        velocity[3 + i] = (T[1, i, 3] - T[0, i, 3]) / dt
-        for j in range(3):
-            J[i, 6 + j] = row_times(T[1].T, j, inverse_J[i]) / dt
-            J[i, j] = -J[i, 6 + j]
-            J[3 + i, 3 + j], J[3 + i, 9 + j] = -T[0, i, j] / dt, T[1, i, j] / dt
-    return T, velocity, J

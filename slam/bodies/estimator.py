@@ -14,13 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.bodies.belief import BodyBelief, Points, begun, carried, compact, slid, window
-from slam.bodies.body_kernels import motion_in_world, predicted_camera
 from slam.bodies.config import MIN_POINTS, RUN
 from slam.chi_square import chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, RecentPoses
 from slam.geometry.arrays import changed, isin
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig, measurement_rows
-from slam.geometry.se3 import Array, adjoint, inverse, log, transform
+from slam.geometry.se3 import Array, adjoint, inverse, log, pose, so3_exp, so3_left_jacobian, so3_log, transform, twice
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.window import pose_only
@@ -136,16 +135,20 @@ class BodyEstimator:
     def _expected(self, b: BodyBelief, cameras: RecentPoses) -> _Expected:
         """With the new frame's pose as the motion model predicts it."""
         dt = float(cameras.stamps[-1] - cameras.stamps[-2])
-        velocity, spread = b.estimate.velocity, b.estimate.velocity_covariance
-        Y, by_impulse, by_velocity = predicted_camera(b.poses[-1], cameras.poses[-2:], velocity, dt)
-        turn = Y[:3, :3].T @ b.poses[-1][:3, :3]
+        T, velocity = cameras.poses[-2] @ inverse(b.poses[-1]), b.estimate.velocity
+        T = pose(so3_exp(dt * velocity[:3]) @ T[:3, :3], T[:3, 3] + dt * velocity[3:])
+        Y = inverse(T) @ cameras.poses[-1]
         b = changed(
             b, stamps=cameras.stamps, poses=np.concatenate([b.poses, Y[None]]), scales=np.append(b.scales, 1.0),
             points=changed(b.points, unseen=b.points.unseen + 1),
         )  # fmt: skip
-        impulse = by_impulse * np.repeat(self.models.velocity_variance(dt)[::-1], 3) @ by_impulse.T
-        covariance = by_velocity @ spread @ by_velocity.T + impulse
-        covariance += relative_covariance(cameras.covariance[-12:, -12:], cameras.poses[-2], cameras.poses[-1])
+        by_step = adjoint(inverse(Y)) * dt
+        back = twice(T[:3, :3].T)
+        impulses = by_step * np.sqrt(np.repeat(self.models.velocity_variance(dt)[::-1], 3))
+        covariance = by_step @ back @ b.estimate.velocity_covariance @ back.T @ by_step.T
+        turn = Y[:3, :3].T @ b.poses[-2][:3, :3]
+        way, impulse = cameras.covariance[-12:, -12:], impulses @ impulses.T
+        covariance = covariance + impulse + relative_covariance(way, cameras.poses[-2], cameras.poses[-1])
         return _Expected(b, covariance, impulse, turn @ b.points.local @ turn.T)
 
     def _predicted(self, b: BodyBelief, cameras: RecentPoses) -> BodyBelief:
@@ -245,17 +248,17 @@ class BodyEstimator:
         self, b: BodyBelief, id: int, cameras: RecentPoses, measured: bool, used: IdArray, rejected: IdArray
     ) -> BodyBelief:
         """With the estimate of its newest frame, where the camera's uncertainty is part of all that is in the world."""
-        X, Y, velocity, spread = cameras.poses[-2:], b.poses[-2:], b.velocity, np.diag(b.sigmas**2)
+        X, Y = cameras.poses[-2:], b.poses[-2:]
         k = 6 * len(Y)
-        A = np.zeros((k, k))
-        for i, own in enumerate(adjoint(Y)):
-            A[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = own
-        P = A @ (b.covariance[-k:, -k:] + cameras.covariance[-k:, -k:]) @ A.T  # of the body's poses
+        by_pose = np.zeros((k, k))
+        for i, A in enumerate(adjoint(Y)):
+            by_pose[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = A
+        P = by_pose @ (b.covariance[-k:, -k:] + cameras.covariance[-k:, -k:]) @ by_pose.T  # of the body's poses
+        T = X[-len(Y) :] @ inverse(Y)
+        velocity, spread = b.velocity, np.diag(b.sigmas**2)
         if len(b) > 1:
-            T, velocity, J = motion_in_world(X, Y, float(b.stamps[-1] - b.stamps[-2]))
+            velocity, J = _velocity(T[0], T[1], float(b.stamps[-1] - b.stamps[-2]))
             spread = J @ P @ J.T
-        else:
-            T = X[-1:] @ inverse(Y)
         estimate = ObjectEstimate(
             id, float(b.stamps[-1]), T[-1], P[-6:, -6:], velocity, spread, measured, used, rejected
         )  # fmt: skip
@@ -282,3 +285,13 @@ def _part(cameras: RecentPoses, first: int, end: int) -> RecentPoses:
         return cameras
     P = cameras.covariance[6 * first : 6 * end, 6 * first : 6 * end].copy()
     return RecentPoses(cameras.stamps[first:end], cameras.poses[first:end], P)
+
+
+def _velocity(before: Array, after: Array, dt: float) -> tuple[Array, Array]:
+    """Velocity [ω, v] (6,) in world axes between two poses, and derivatives (6, 12) by both, perturbed on the right."""
+    turn = so3_log(after[:3, :3] @ before[:3, :3].T)
+    J = np.zeros((6, 12))
+    by_turn = np.linalg.inv(so3_left_jacobian(turn)) @ after[:3, :3] / dt
+    J[:3, :3], J[:3, 6:9] = -by_turn, by_turn
+    J[3:, 3:6], J[3:, 9:] = -before[:3, :3] / dt, after[:3, :3] / dt
+    return np.concatenate([turn, after[:3, 3] - before[:3, 3]]) / dt, J

@@ -11,7 +11,7 @@ from slam.bodies.bodies import Body
 from slam.bodies.config import MIN_FRAMES
 from slam.bodies.frame import Frame, Setup
 from slam.bodies.track_kernels import fit_tracks, measure
-from slam.data import BoolArray, IndexArray
+from slam.data import IndexArray
 from slam.geometry.rig import StereoRig, measurement_rows
 from slam.geometry.se3 import Array
 from slam.tracks.table import Tracks
@@ -43,8 +43,7 @@ def record_in(tracks: Tracks, rows: IndexArray, setup: Setup, T_world_left: Arra
 
 def fit_positions(tracks: Tracks, rows: IndexArray) -> None:
     """Fit fixed points to the windows of tracks, in place."""
-    tracks.velocity[rows] = 0
-    _fit(tracks, rows, np.zeros(len(tracks), bool), 0, np.zeros(tracks.dof.shape[1]), 0.0)
+    fit(tracks, rows, np.zeros(tracks.dof.shape[1]), 1.0)  # at one time there is no velocity
 
 
 def fit(tracks: Tracks, rows: IndexArray, times: Array, max_speed: float) -> None:
@@ -52,13 +51,9 @@ def fit(tracks: Tracks, rows: IndexArray, times: Array, max_speed: float) -> Non
 
     Those may that are in doubt, had a velocity before, or have few measurements; see `constant_velocity`.
     """
-    _fit(tracks, rows, tracks.doubtful, MIN_FRAMES, times, max_speed**-2)
-
-
-def _fit(tracks: Tracks, rows: IndexArray, asked: BoolArray, least: int, times: Array, prior: float) -> None:
     t = tracks
     into = t.position, t.covariance, t.velocity, t.velocity_covariance
-    fit_tracks(t.A, t.p, t.dof, t.anchor, rows, asked, least, times, prior, MOVES, *into)
+    fit_tracks(t.A, t.p, t.dof, t.anchor, rows, t.doubtful, MIN_FRAMES, times, max_speed**-2, MOVES, *into)
 
 
 @dataclass(frozen=True, eq=False)

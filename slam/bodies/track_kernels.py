@@ -81,14 +81,8 @@ def fit_tracks(A, p, dof, anchor, rows, asked, least, times, prior, moves, posit
     Returns χ²(3) of the velocities (M,), 0 where none was sought.
     """
     test, even, M2, S, G = np.zeros(len(rows)), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    M0, M1, P, b0, b1, told = (
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty(3),
-        np.empty(3),
-        np.empty(3),
-    )
+    M0, M1, P = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    b0, b1, told = np.empty(3), np.empty(3), np.empty(3)
     for m in range(len(rows)):
         n = rows[m]
         M0[:], M1[:], M2[:], b0[:], b1[:] = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -160,13 +154,8 @@ def displaced(A, p, dof, rows, ages, most_recent, rays, centres, slide):
     which it is seen otherwise [rad]. Displacements (M, 3), their information (M, 3, 3), and lags (M,) [frames].
     """
     d, W, lag = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3)), np.empty(len(rows))
-    total, P, told, age, slots = (
-        np.empty((2, 3, 3)),
-        np.empty((2, 3, 3)),
-        np.empty((2, 3)),
-        np.empty(2),
-        np.empty(2, np.intp),
-    )
+    total, P, told = np.empty((2, 3, 3)), np.empty((2, 3, 3)), np.empty((2, 3))
+    age, slots = np.empty(2), np.empty(2, np.intp)
     for m in range(len(rows)):
         n = rows[m]
         recent = min(max(_count(dof[n]) // 2, 2), most_recent)
