@@ -105,7 +105,7 @@ def run_on(page):
     return [words for words in at_hand if page == README or words not in run_on(README)]
 
 
-@pytest.mark.parametrize("page", filter(run_on, PAGES), ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", [page for page in PAGES if run_on(page)], ids=lambda page: page.stem)
 def test_commands_run(page, reader, tmp_path, monkeypatch):
     shutil.copytree(reader, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)

@@ -14,18 +14,13 @@ from tests.backends.scenes import Scene, path, scene, step
 FORWARD, STILL = np.array([0, 0, 1.5]), np.zeros(3)
 YAW, ROLL = np.array([0, 1.0, 0]), np.array([0, 0, 1.0])
 MODELS = EstimatorModels(MotionModel(0.3, 0.3), pixel_sigma=0.5)
+DRIVE = scene(path(30, 0.1, FORWARD, 0.3 * YAW), points=300)  # of 30 frames, that turns
 
 
 def errors(backend: EkfBackend, truth: np.ndarray) -> np.ndarray:
     """Largest rotation [rad] and translation error [m] over the trajectory."""
     xi = se3.log(se3.inverse(truth) @ backend.trajectory().poses)
     return np.array([np.linalg.norm(xi[:, :3], axis=1).max(), np.linalg.norm(xi[:, 3:], axis=1).max()])
-
-
-def nees(backend: EkfBackend, truth: np.ndarray) -> float:
-    found = backend.estimate(landmarks=False)
-    xi = se3.log(se3.inverse(found.T_world_left) @ truth)
-    return float(xi @ np.linalg.solve(found.covariance, xi))
 
 
 def dense(covariance: Covariance) -> np.ndarray:
@@ -48,8 +43,3 @@ def predicted(data: Scene, frames: int, **options) -> tuple[EkfBackend, Observat
     backend.predict(float(data.stamps[frames]))
     seen = data.observations[frames]
     return backend, seen.select(np.array([i in known for i in seen.ids.tolist()]))
-
-
-def turning_drive() -> Scene:
-    """A drive of 30 frames that turns."""
-    return scene(path(30, 0.1, FORWARD, 0.3 * YAW), points=300)

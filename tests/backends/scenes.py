@@ -127,6 +127,20 @@ def step(backend: Backend, stamp: float, seen: Observations, known: set[int]) ->
     return report
 
 
+def nees(backend: Backend, truth: Array) -> float:
+    """Squared distance of the newest pose from the true one by its covariance: χ²₆ exceeds 25 once in 3000 times."""
+    found = backend.estimate(landmarks=False)
+    xi = se3.log(se3.inverse(found.T_world_left) @ truth)
+    return float(xi @ np.linalg.solve(found.covariance, xi))
+
+
+def forget(backend: Backend, known: set[int], seen: Observations) -> None:
+    """Remove landmarks that are not in view; `known` shrinks."""
+    gone = sorted(known - set(seen.ids.tolist()))
+    backend.remove(gone)
+    known.difference_update(gone)
+
+
 def run(backend: Backend, data: Scene) -> list[UpdateReport]:
     """All frames of a scene through a back end."""
     known: set[int] = set()

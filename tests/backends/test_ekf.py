@@ -18,16 +18,11 @@ from slam.errors import ConfigurationError
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel, SlideModel, models_for
 from slam.third_party import OnlinePose, derived_recent
-from tests.backends.ekf_runs import FORWARD, MODELS, YAW, dense, halfway, nees, turning_drive
-from tests.backends.scenes import RIG, Scene, cloud, observe, path, random_path, run, scene, step
+from tests.backends.ekf_runs import DRIVE, FORWARD, MODELS, YAW, dense, halfway
+from tests.backends.scenes import RIG, cloud, nees, observe, path, random_path, run, scene, step
 from tests.slam.numeric import jacobian
 
 # --- options ---
-
-
-@pytest.fixture(scope="module")
-def drive() -> Scene:
-    return turning_drive()
 
 
 def test_wrong_options_are_refused():
@@ -64,9 +59,9 @@ def test_nees_and_nis_are_in_their_bands(make):
     assert 1.5 < np.median(np.concatenate(landmark_nees)) < 4.0  # χ²₃: 2.4; landmarks of a run are correlated
 
 
-def test_the_papers_filter_has_one_name(drive):
+def test_the_papers_filter_has_one_name():
     printed = {"measurement": "left", "iterations": 1, "landmarks": "euclidean", "consistent": False}
-    one, other = (halfway(drive, 8, **options)[0].estimate() for options in ({"papers": True}, printed))
+    one, other = (halfway(DRIVE, 8, **options)[0].estimate() for options in ({"papers": True}, printed))
     np.testing.assert_array_equal(one.T_world_left, other.T_world_left)
     np.testing.assert_array_equal(one.covariance, other.covariance)
 
@@ -85,7 +80,7 @@ def test_the_papers_filter_has_one_name(drive):
     ],
     ids=str,
 )
-def test_what_nothing_measures_stays_unknown(drive, make, options):
+def test_what_nothing_measures_stays_unknown(make, options):
     """A displacement of camera and landmarks together stays as uncertain as the first pose was.
 
     The information (the inverse of the covariance) on it is that of the prior, 1 in units of its sigmas, and so it is
@@ -94,7 +89,7 @@ def test_what_nothing_measures_stays_unknown(drive, make, options):
     sigma, learnt, ekf = 0.01, [], make is EkfBackend
     models = replace(MODELS, initial_position_sigma=sigma, initial_rotation_sigma=sigma)
     options, fast = {k: v for k, v in options.items() if k != "fast"}, "fast" in options
-    data = scene(path(30, 0.1, FORWARD, 3 * YAW), points=1000) if fast else drive
+    data = scene(path(30, 0.1, FORWARD, 3 * YAW), points=1000) if fast else DRIVE
     for consistent in ({"consistent": True}, {"consistent": False}) if ekf else ({},):
         backend, known = make(RIG, models, **options, **consistent), set()
         for stamp, _, seen in list(data)[:25]:
@@ -251,10 +246,10 @@ def test_the_motion_and_its_derivatives():
 
 def test_a_camera_far_from_zero_loses_no_digits():
     """At map coordinates of a country."""
-    drive, there = turning_drive(), se3.pose(np.eye(3), [4e5, -2e5, 5e6])
+    there = se3.pose(np.eye(3), [4e5, -2e5, 5e6])
     backends = [IekfBackend(RIG, replace(MODELS, T_world_left=T)) for T in (np.eye(4), there)]
     for backend in backends:
-        run(backend, drive)
+        run(backend, DRIVE)
     one, other = (backend.estimate(landmarks=False) for backend in backends)
     assert np.abs(se3.inverse(there) @ other.T_world_left - one.T_world_left).max() < 1e-6
     np.testing.assert_allclose(other.covariance, one.covariance, rtol=1e-3, atol=1e-12)

@@ -16,29 +16,13 @@ from backends.iekf import IekfBackend
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel, SlideModel, models_for
-from tests.backends.ekf_runs import (
-    FORWARD,
-    MODELS,
-    ROLL,
-    STILL,
-    YAW,
-    dense,
-    errors,
-    nees,
-    predicted,
-    turning_drive,
-)
+from tests.backends.ekf_runs import DRIVE, FORWARD, MODELS, ROLL, STILL, YAW, dense, errors, predicted
 from tests.backends.hostile_calls import play
-from tests.backends.scenes import RIG, Scene, cloud, observe, path, run, scene, step
+from tests.backends.scenes import RIG, cloud, nees, observe, path, run, scene, step
 
 # --- gaps and turns ---
 
 BOTH = pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])
-
-
-@pytest.fixture(scope="module")
-def drive() -> Scene:
-    return turning_drive()
 
 
 @pytest.mark.parametrize("rate", [YAW, ROLL, np.array([0.6, 0.6, 0.6])], ids=["heading", "roll", "all"])
@@ -136,10 +120,10 @@ def test_no_landmark_loses_its_variance(name, seed):
 
 @BOTH
 @pytest.mark.parametrize("share", [0.1, 0.5])
-def test_wrong_matches_are_found(make, drive, share):
+def test_wrong_matches_are_found(make, share):
     rng = np.random.default_rng(3)
     backend, known, missed, false, wrong = make(RIG, MODELS), set(), 0, 0, 0
-    for stamp, _, seen in drive:
+    for stamp, _, seen in DRIVE:
         old = np.array([i in known for i in seen.ids.tolist()], bool)
         backend.predict(stamp)
         bad = old & (rng.random(len(seen)) < share)
@@ -153,13 +137,13 @@ def test_wrong_matches_are_found(make, drive, share):
         false += np.isin(seen.ids[old & ~bad], report.rejected).sum()
     assert wrong > 50 and missed < 0.03 * wrong  # some shifts are small
     assert false < 10
-    assert errors(backend, drive.poses).max() < 0.04
+    assert errors(backend, DRIVE.poses).max() < 0.04
 
 
-def test_a_landmark_in_contradiction_with_the_others_is_found(drive):
+def test_a_landmark_in_contradiction_with_the_others_is_found():
     """An innovation within its own wide gate, but not where the others say: the velocity is unknown at first."""
     models = replace(models_for("driving"), pixel_sigma=0.5, slide=SlideModel())
-    backend, seen = predicted(drive, 1, models=models)
+    backend, seen = predicted(DRIVE, 1, models=models)
     uv_left, uv_right = seen.uv_left.copy(), seen.uv_right.copy()
     uv_left[5] += [8.0, -6.0]
     uv_right[5] += [8.0, -6.0]
@@ -169,8 +153,8 @@ def test_a_landmark_in_contradiction_with_the_others_is_found(drive):
 
 @pytest.mark.parametrize("entry", [-1.0, np.nan, np.inf])
 @pytest.mark.parametrize("where", ["pose", "landmark"])
-def test_a_broken_covariance_is_a_status_with_a_reason(drive, entry, where):
-    backend, seen = predicted(drive, 5)
+def test_a_broken_covariance_is_a_status_with_a_reason(entry, where):
+    backend, seen = predicted(DRIVE, 5)
     P = backend.state.covariance
     broken, row = P.P.copy(), 1 if where == "pose" else P.indices(backend.state.landmarks.rows_of(seen.ids[3:4]))[0, 0]
     broken[row, row] = entry
@@ -184,8 +168,8 @@ def test_a_broken_covariance_is_a_status_with_a_reason(drive, entry, where):
 
 
 @pytest.mark.parametrize("turn", [4.0, np.nan])
-def test_a_step_of_more_than_half_a_turn_is_a_status_with_a_reason(drive, monkeypatch, turn):
-    backend, seen = predicted(drive, 5)
+def test_a_step_of_more_than_half_a_turn_is_a_status_with_a_reason(monkeypatch, turn):
+    backend, seen = predicted(DRIVE, 5)
     solved = Linearisation.solved
 
     def turned(self: Linearisation, used: np.ndarray) -> Correction:

@@ -18,7 +18,7 @@ from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels, MotionModel
 from slam.window import motion
 from slam.window.stereo import RectifiedStereo
-from tests.backends.scenes import RIG, observe, path, random_path, run, scene, step, with_far_points
+from tests.backends.scenes import RIG, forget, nees, observe, path, random_path, run, scene, step, with_far_points
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
 DT = 0.1
@@ -42,22 +42,13 @@ def sigma(backend):
     return np.sqrt(np.trace(backend.estimate(landmarks=False).covariance[3:, 3:]))
 
 
-def distance(backend, truth):
-    """Squared distance of the newest pose from the true one by its covariance: χ²₆ exceeds 25 once in 3000 times."""
-    last = backend.estimate(landmarks=False)
-    off = se3.log(se3.inverse(last.T_world_left) @ truth)
-    return off @ np.linalg.solve(last.covariance, off)
-
-
 def tracked(data, **options):
     """A back end after a scene; landmarks that are out of view are removed."""
     models = options.pop("models", MODELS)
     backend, known = SmootherBackend(RIG, models, **options), set()
     for stamp, _, seen in data:
         step(backend, stamp, seen, known)
-        gone = sorted(known - set(seen.ids.tolist()))
-        backend.remove(gone)
-        known.difference_update(gone)
+        forget(backend, known, seen)
     return backend
 
 
@@ -70,7 +61,7 @@ def test_the_path_and_its_covariance_with_all_options(options):
     backend = tracked(data, **options)
     moved, turned = errors(backend.trajectory().poses, data.poses)
     assert moved.max() < 0.1 and turned.max() < 0.01
-    assert distance(backend, data.poses[-1]) < 25
+    assert nees(backend, data.poses[-1]) < 25
     assert backend.revises_path == (options.get("lag", 16) is None)
     assert (len(backend.state.sights) < 9) == ("past" in options), "what is kept does not grow for ever"
 
@@ -92,9 +83,7 @@ def test_far_landmarks_that_soon_leave_are_not_believed_too_much(seen_at_once, s
     backend = SmootherBackend(RIG, models)
     for k, (stamp, truth, seen) in enumerate(data):
         assert step(backend, stamp, seen, known).status is UpdateStatus.OK or not k, "also with far points alone"
-        gone = sorted(known - set(seen.ids.tolist()))
-        backend.remove(gone)
-        known.difference_update(gone)
+        forget(backend, known, seen)
         off = np.linalg.norm(backend.estimate(landmarks=False).T_world_left[:3, 3] - truth[:3, 3])
         assert off < min(3 * sigma(backend), most), k
 
@@ -141,29 +130,29 @@ def test_frames_that_measured_nothing_are_no_failure(lag, dark):
         report = step(backend, stamp, seen, known)
         assert not k or (report.status is UpdateStatus.OK and not report.reason), (k, report.reason)
         assert len(report.rejected) < 3
-    assert distance(backend, data.poses[-1]) < 25
+    assert nees(backend, data.poses[-1]) < 25
     assert lag < 4 or sigma(backend) < 0.04
 
 
 def test_poses_that_are_solved_for_alone_count_nothing_twice():
     """As if each measured other landmarks: errors were 3.4 times those with every pose in the graph."""
     models = EstimatorModels(MotionModel(1.0, 0.3), 0.7, initial_velocity_sigma=15.0)
-    off, nees = {"every": [], "seen": []}, []
+    off, squares = {"every": [], "seen": []}, []
     for poses, seed in itertools.product(off, range(5)):
         rng = np.random.default_rng(seed)
         data = scene(random_path(60, DT, np.array([0.0, 0.0, 1.5]), models.motion, rng), 600, 0.7, DT, seed, 18)
         backend, known = SmootherBackend(RIG, models, poses=poses), set()
         for stamp, T, seen in data:
             step(backend, stamp, seen, known)
-            nees.append(distance(backend, T) / 6 if poses == "seen" else 1.0)
+            squares.append(nees(backend, T) / 6 if poses == "seen" else 1.0)
         off[poses].append(errors(backend.estimate(landmarks=False).T_world_left, T)[0])
     assert 1.1 < np.linalg.norm(off["seen"]) / np.linalg.norm(off["every"]) < 2.2, "much is not told the graph"
-    assert np.mean(nees) < 1.2
+    assert np.mean(squares) < 1.2
 
 
 def test_a_pose_that_is_solved_for_aside_tells_of_the_one_before_it():
     """After frames in the dark, the velocity was that of a pose which had not been moved along, and said to be sure."""
-    models, nees = EstimatorModels(MotionModel(1.0, 1.0), pixel_sigma=0.5), []
+    models, squares = EstimatorModels(MotionModel(1.0, 1.0), pixel_sigma=0.5), []
     for seed in range(30):
         poses = random_path(20, DT, np.zeros(3), models.motion, np.random.default_rng(seed))
         data, backend, known = scene(poses, points=150, seed=seed), SmootherBackend(RIG, models, poses="seen"), set()
@@ -171,12 +160,12 @@ def test_a_pose_that_is_solved_for_aside_tells_of_the_one_before_it():
             if 10 <= k < 14 or k == 15:
                 backend.predict(stamp)
                 if k == 15:
-                    nees.append(distance(backend, T))
+                    squares.append(nees(backend, T))
                     break
                 backend.update(Observations.empty())
             else:
                 step(backend, stamp, seen, known)
-    assert np.mean(nees) < 10
+    assert np.mean(squares) < 10
 
 
 @pytest.mark.parametrize("lag", [4, None])
@@ -192,7 +181,7 @@ def test_a_long_rest_is_no_burden_and_its_map_is_still_known(lag):
     for k, (_, _, seen) in enumerate(data[20:], 1):
         report = step(backend, last[0] + DT * (350 + k), seen, known)
         assert report.status is UpdateStatus.OK and len(report.rejected) < 4
-    assert distance(backend, data[23][1]) < 25 and sigma(backend) < 2 * before
+    assert nees(backend, data[23][1]) < 25 and sigma(backend) < 2 * before
     assert len(backend.trajectory()) == 374
 
 

@@ -7,6 +7,10 @@ from functools import cache
 import cv2
 import numpy as np
 
+from slam.geometry.rig import StereoRig
+
+RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
+
 
 @cache
 def texture(height, width, seed=0, finest=1.5):

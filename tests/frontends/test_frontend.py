@@ -13,11 +13,9 @@ from frontends.surf.images import Sampler
 from frontends.surf.keypoints import adapted_threshold, spread
 from slam.data import StereoFrame
 from slam.errors import SequenceError
-from slam.geometry.rig import StereoRig
 from slam.interfaces import Frontend
-from tests.frontends.scenes import stereo_pair
+from tests.frontends.scenes import RIG, stereo_pair
 
-RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
 LEFT, RIGHT = stereo_pair(12.0)
 BLACK = np.zeros((240, 320), np.uint8)
 

@@ -12,9 +12,7 @@ from slam.geometry import se3
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.interfaces import AligningFrontend
-from tests.frontends.scenes import photograph, stereo_pair, texture
-
-RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
+from tests.frontends.scenes import RIG, photograph, stereo_pair, texture
 
 
 @pytest.mark.parametrize(("disparity", "exposure"), [(2.5, 1), (12.0, 1), (12.25, 1), (37.75, 1), (12.25, 0.6)])

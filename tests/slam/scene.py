@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry import se3
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
+from slam.models import EstimatorModels
+from slam.tracks.config import MapConfig
 
 RIG = StereoRig.rectified_pair(300, 159.5, 119.5, 0.12, 320, 240)
+
+#: For its points.
+CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5), map=MapConfig(target_in_view=40, max_depth_error=0.3))
 
 #: Distorted, with the right camera turned and shifted.
 GENERAL_RIG = StereoRig(

@@ -11,13 +11,11 @@ from backends.ekf import EkfBackend
 from frontends.surf import SurfFrontend
 from slam.data import Observations, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError, PartError, SlamError
-from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
-from tests.frontends.scenes import stereo_pair
+from tests.frontends.scenes import RIG, stereo_pair
 from tests.scripts import load_script
 
-RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
 LEFT, RIGHT = stereo_pair(12.25)
 
 

@@ -6,16 +6,12 @@ import numpy as np
 import pytest
 
 import slam
-from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures, StereoFrame
 from slam.errors import MeasurementError, SequenceError
-from slam.models import EstimatorModels
 from slam.system import StereoSlam
-from slam.tracks.config import MapConfig
-from tests.slam.scene import RIG, Cloud, path
+from tests.slam.scene import CONFIG, RIG, Cloud, path
 
 BACKENDS = ("ekf", "iekf", "smoother", "window")
-CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5), map=MapConfig(target_in_view=40, max_depth_error=0.3))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -10,16 +10,12 @@ from functools import partial
 import numpy as np
 import pytest
 
-from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
 from slam.errors import MeasurementError
-from slam.models import EstimatorModels
 from slam.system import StereoSlam
-from slam.tracks.config import MapConfig
-from tests.slam.scene import RIG, Cloud, path
+from tests.slam.scene import CONFIG, RIG, Cloud, path
 
 BACKENDS = ("ekf", "smoother", "window")
-CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5), map=MapConfig(target_in_view=40, max_depth_error=0.3))
 COLUMNS = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
 
 
