@@ -117,7 +117,7 @@ def places_in_view(local: Array) -> Array:
     return np.column_stack([local[:, :2] / depth, np.log(depth)])
 
 
-def limit(test: float, size: Any) -> Any:
+def limit(test: float, size: IndexArray | int) -> Any:
     """χ²(6) from which a group of so many tracks moved: small groups have the heavier tails of single tracks."""
     return test * (1.0 + _TAIL / size)
 
@@ -263,14 +263,8 @@ def parting(
     at, rows = at[free], rows[free]
     z = measurement_rows(features.uv_left[rows], features.uv_right[rows])
     position, A, p, dof = t.position[at], t.A[at], t.p[at], t.dof[at]
-    record_in(
-        changed(t, position=position, anchor=t.anchor[at], A=A, p=p, dof=dof),
-        np.arange(len(at)),
-        setup,
-        T_world_left,
-        z,
-        slot,
-    )
+    theirs = changed(t, position=position, anchor=t.anchor[at], A=A, p=p, dof=dof)
+    record_in(theirs, np.arange(len(at)), setup, T_world_left, z, slot)
     local = transform(inverse(T_world_left), position)
     known = local[:, 2] > FARTHEST * np.sqrt(np.trace(t.covariance[at], axis1=1, axis2=2))
     well = known & (dof[:, slot] > 0) & (t.count(at) >= MIN_FRAMES)

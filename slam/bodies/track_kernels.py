@@ -126,18 +126,16 @@ def fit_tracks(A, p, dof, anchor, rows, asked, least, times, prior, moves, posit
 
 @kernel
 def well_known(T_world_left, position, covariance, dof, rows, least, farthest):
-    """Those of the tracks measured `least` times whose depth is `farthest` times its deviation; x/z, y/z, log z (K, 3).
+    """Those of the tracks (K,) measured `least` times whose depth is known, and where they are seen from a pose (4, 4).
 
-    So they are seen from a pose (4, 4).
+    Known is a depth of more than `farthest` times its deviation. Seen they are at x/z, y/z, log z (K, 3).
     """
     known, place, local, k = np.empty(len(rows), np.intp), np.empty((len(rows), 3)), np.empty(3), 0
     for m in range(len(rows)):
         n = rows[m]
-        variance = trace(covariance[n])
+        variance = trace(covariance[n])  # below 0 by rounding alone
         transform_back(T_world_left, position[n], local)
-        if (
-            _count(dof[n]) < least or variance < 0.0 or not local[2] > farthest * np.sqrt(variance)
-        ):  # below 0 by rounding alone
+        if _count(dof[n]) < least or variance < 0.0 or not local[2] > farthest * np.sqrt(variance):
             continue
         depth = max(local[2], 1e-9)
         known[k], place[k, 0], place[k, 1], place[k, 2] = n, local[0] / depth, local[1] / depth, np.log(depth)
