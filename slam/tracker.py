@@ -27,7 +27,6 @@ from slam.data import (
     FrameResult,
     FrameStatus,
     IdArray,
-    Observations,
     Prediction,
     Revision,
     StereoFeatures,
@@ -36,7 +35,7 @@ from slam.data import (
 )  # fmt: skip
 from slam.geometry.arrays import Array, changed, isin
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig
-from slam.geometry.se3 import inverse, transform, twice
+from slam.geometry.se3 import inverse, twice
 from slam.geometry.trajectory import Trajectory
 from slam.input.warnings import REPEATED
 from slam.interfaces import AligningFrontend, Backend, Frontend, MapBackend, RestingBackend, RevisingBackend
@@ -211,9 +210,6 @@ class Tracker:
         holds = standing.stands and not before.unmeasured and isinstance(state.backend, RestingBackend)
         if holds:
             observations, pose = observations.select(np.zeros(0, np.intp)), None
-        elif standing.rest is not None and standing.goes_on:  # landmarks have followed the body until this was known
-            pose = standing.rest.T_world_left
-            observations = self._seen_from(pose, state.backend, step.prediction.ids)
         report: UpdateReport = checked(state.backend, "update", state.backend.update(observations, pose))
         if holds and len(matches.ids) and report.status is not UpdateStatus.FAILED:
             report = replace(report, status=UpdateStatus.OK, reason="", used=matches.ids)
@@ -233,13 +229,6 @@ class Tracker:
         ):  # fmt: skip
             return Elsewhere(None)
         return changed(step, report=report, tracking=tracking)
-
-    def _seen_from(self, T_world_left: Array, backend: Backend, ids: IdArray) -> Observations:
-        """Landmarks at the pixels at which they would be seen from a pose (4, 4)."""
-        local = transform(inverse(T_world_left), checked(backend, "positions", backend.positions(ids), n=len(ids)))
-        left, right = self.rig.project(local)
-        view = self.rig.left.in_image(left) & self.rig.right.in_image(right)
-        return Observations(ids[view], left[view], right[view])
 
     def estimate(self, state: State, step: Step) -> Step:
         """The camera's pose after an update; the rig's calibration learns from the frame."""

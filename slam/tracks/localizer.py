@@ -63,23 +63,19 @@ class Search:
 
         `localize`, unless the camera stands in spite of the pose on which landmarks agree: then what stays is matched.
         """
-        stood, went_on = standing.stands, standing.goes_on
-        if stood:
+        if standing.stands:
             matches = self.match()
-        else:
-            matches, tracking = self.localize(tracking, elsewhere)
-        if matches.T_world_left is not None and not matches.kidnapped:
-            rig, sigma = self.localizer.rig, self.localizer.models.pixel_sigma
-            standing = standing.contested(rig, sigma, self.features, matches.rows, matches.T_world_left)
-        if standing.goes_on and not went_on:  # until now the pose was that of a body that moves
-            tracking = changed(tracking, unmeasured=1)
-        if standing.stands and 2 * isin(matches.rows, standing.witnesses).sum() <= len(matches):
-            staying = changed(self, features=self.features.select(standing.witnesses))
-            matches, _ = staying.match_around(standing.T_world_left)
-            matches = changed(matches, rows=standing.witnesses[matches.rows])
-        if stood and not (standing.stands and (len(matches) or standing.holds(tracking.lost))):
-            matches, tracking = self.localize(tracking, elsewhere)
-        return matches, tracking, standing
+            if matches.T_world_left is not None:
+                rig, sigma = self.localizer.rig, self.localizer.models.pixel_sigma
+                standing = standing.contested(rig, sigma, self.features, matches.rows, matches.T_world_left)
+            if standing.stands:
+                if 2 * isin(matches.rows, standing.witnesses).sum() <= len(matches):
+                    staying = changed(self, features=self.features.select(standing.witnesses))
+                    matches, _ = staying.match_around(standing.T_world_left)
+                    matches = changed(matches, rows=standing.witnesses[matches.rows])
+                if len(matches) or standing.holds(tracking.lost):
+                    return matches, tracking, standing
+        return *self.localize(tracking, elsewhere), standing
 
     def localize(
         self, tracking: TrackingState, elsewhere: Callable[[], Array | None] = lambda: None

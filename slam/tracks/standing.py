@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from slam.chi_square import SIGMAS, chi_square_limit
 from slam.data import StereoFeatures
-from slam.geometry.arrays import BoolArray, Table, changed, median, quantile
+from slam.geometry.arrays import Table, changed, median
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig, measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.tracks.follow import Windows, follow
@@ -62,39 +62,6 @@ class Places(Table):
         return kept.joined(Places.of(z[new], features.select(new)))
 
 
-def _none() -> NDArray[np.intp]:
-    return np.zeros(0, np.intp)
-
-
-@dataclass(frozen=True, eq=False)
-class Rest:
-    """A rest that a common motion has ended: of the camera, or of a body that fills most of the view.
-
-    Features that stay exactly where they were refute the camera's motion, unless they are too far to show it, or are
-    fastened to the camera: such are nearer than nearly all that moves.
-    """
-
-    places: Places  # features that stayed
-    T_world_left: Array  # the camera's pose (4, 4)
-    rows: NDArray[np.intp] = field(default_factory=_none)  # rows of the present features that still stay (M,)
-    shift: Array = field(default_factory=lambda: np.zeros((0, 3)))  # of these since the rest (M, 3) [px]
-    unseen: int = 0  # frames in succession in which these were too few to tell
-    refuted: int = 0  # frames in succession in which they refuted the camera's motion
-
-    @property
-    def goes_on(self) -> bool:
-        """Whether the camera rests, as it is a body that moves."""
-        return self.refuted >= _FRAMES
-
-    def after(self, z: Array, seen: StereoFeatures, stereo: NDArray[np.intp], sigma: float) -> Rest | None:
-        """The rest after a frame with features (N,) at `z` (N, 3), in rows `stereo`; None if it is over."""
-        _, rows, shift = _staying(self.places, np.inf, z, seen, sigma)
-        unseen = self.unseen + 1 if len(rows) <= _FEW else 0
-        if unseen > (_FRAMES if self.goes_on else 0):
-            return None
-        return changed(self, rows=stereo[rows], shift=shift, unseen=unseen)
-
-
 @dataclass(frozen=True, eq=False)
 class Standing:
     """What is known of a camera at rest."""
@@ -107,17 +74,11 @@ class Standing:
     # the camera's pose (4, 4) in the last frame whose images were new
     T_world_left: Array = field(default_factory=lambda: np.eye(4))
     blind: int = 0  # number of frames in which too little of what stays was seen to tell, as something hides it
-    rest: Rest | None = None  # an earlier one, while features stay where they were then
 
     @cached_property
     def stands(self) -> bool:
         """Whether the camera stands for certain."""
-        return self.frames > _FRAMES or self.goes_on
-
-    @property
-    def goes_on(self) -> bool:
-        """Whether it is the earlier rest that goes on."""
-        return self.rest is not None and self.rest.goes_on
+        return self.frames > _FRAMES
 
     def holds(self, lost: bool) -> bool:
         """Whether the camera stands at a known place, or something hides what it knows: then no other is looked for."""
@@ -125,61 +86,45 @@ class Standing:
 
     def after(self, rig: StereoRig, sigma: float, features: StereoFeatures) -> Standing:
         """What a frame's features with a right pixel say; `sigma` is the pixel noise [px]."""
-        standing = self._after(rig, sigma, features)
-        return changed(standing, witnesses=standing.rest.rows) if standing.rest and standing.goes_on else standing
-
-    def _after(self, rig: StereoRig, sigma: float, features: StereoFeatures) -> Standing:
         stereo, places = np.flatnonzero(features.has_stereo), self.places
         seen = features.select(stereo)
         z = measurement_rows(seen.uv_left, seen.uv_right)
         begun = Standing(Places.of(z, seen), T_world_left=self.T_world_left)
         if places is None or places.descriptors.shape[1] != seen.descriptors.shape[1]:
             return begun
-        rest = None if self.rest is None else self.rest.after(z, seen, stereo, sigma)
-        begun, stood = changed(begun, rest=rest), self.frames > _FRAMES
-        at, rows, shift = _staying(places, self.variance, z, seen, sigma)
+        radius, none = SIGMAS * np.sqrt(2.0) * sigma, np.zeros((len(places.z), 2, 2))
+        # 0.5: largest distance of descriptors of one feature in unchanged light
+        near = Windows((1.0,), (0.5,), 1.0, radius, radius)
+        pairs = follow(places.z[:, :2], none, places.descriptors, places.laplacian, seen, near)
+        at, rows = pairs.tracks, pairs.features
+        shift = z[rows] - places.z[at]
+        stay = np.square(shift).sum(axis=1) <= _GATE * min(self.variance, 2.0 * sigma**2)
+        at, rows, shift = at[stay], rows[stay], shift[stay]
         most = 2 * len(rows) > min(len(z), int((places.missed == 0).sum()))
-        if not (stood or most):
+        if not (self.stands or most):
             return begun
         witnesses = stereo[rows[places.sights[at] >= _FRAMES]]
         places_after = places.after(at, rows, z, seen)
         at_rest, variance = _at_rest(rig, places.z[at], shift, self.variance)
         if at_rest:
-            return changed(begun, places=places_after, frames=self.frames + 1, witnesses=witnesses, variance=variance)
-        if stood and len(rows) <= _FEW and self.blind < min(self.frames, 10):  # frames: then carried off
-            return changed(self, places=places_after, witnesses=witnesses, blind=self.blind + 1, rest=rest)
-        return changed(begun, rest=rest or _ended(places, self.T_world_left)) if stood else begun
+            return Standing(places_after, self.frames + 1, witnesses, variance, self.T_world_left)
+        if self.stands and len(rows) <= _FEW and self.blind < min(self.frames, 10):  # frames: then carried off
+            return changed(self, places=places_after, witnesses=witnesses, blind=self.blind + 1)
+        return begun
 
     def contested(
         self, rig: StereoRig, sigma: float, features: StereoFeatures, matched: NDArray[np.intp], T_world_left: Array
     ) -> Standing:
         """At rest no more if a motion of the camera explains all: landmarks left their pixels by it, few witnesses do.
 
-        At rest again where features that stayed in an earlier rest refute that motion. `sigma` is the pixel noise [px],
-        `matched` are rows of the features that agree on a pose `T_world_left` (4, 4).
+        `sigma` is the pixel noise [px], `matched` are rows of the features that agree on a pose `T_world_left` (4, 4).
         """
-        if self.goes_on:
-            return self
-        after, motion = self, inverse(T_world_left) @ self.T_world_left
-        z = measurement_rows(features.uv_left, features.uv_right)
-        if self.stands:
-            left = np.setdiff1d(matched, self.witnesses)
-            moved, witnesses = (_moved(rig, sigma, z[rows], z[rows], motion).sum() for rows in (left, self.witnesses))
-            # 0.1: share of landmarks that a motion must move, for it to be one
-            if moved > 0.1 * len(matched) and 2 * witnesses < max(len(self.witnesses), 1):
-                after = changed(self.moving(), rest=self.rest or _ended(self.places, self.T_world_left))
-        rest = after.rest
-        if rest is None or not len(rest.rows):
-            return after
-        motion = inverse(T_world_left) @ rest.T_world_left
-        left = np.setdiff1d(matched[features.has_stereo[matched]], rest.rows)
-        moving = left[_moved(rig, sigma, z[left], z[left], motion)]
-        stay = rest.rows[_moved(rig, sigma, z[rest.rows] - rest.shift, z[rest.rows], motion)]
-        refuted = min(len(stay), len(moving)) > _FEW and not _nearer(z, stay, moving)
-        rest = changed(rest, refuted=rest.refuted + 1 if refuted else 0)
-        if not rest.goes_on:
-            return changed(after, rest=rest)
-        return changed(after, rest=rest, witnesses=rest.rows, T_world_left=rest.T_world_left)
+        motion = inverse(T_world_left) @ self.T_world_left
+        left = np.setdiff1d(matched, self.witnesses)
+        moved, witnesses = (_moved(rig, sigma, features, rows, motion) for rows in (left, self.witnesses))
+        # 0.1: share of landmarks that a motion must move, for it to be one
+        explains = moved > 0.1 * len(matched) and 2 * witnesses < max(len(self.witnesses), 1)
+        return self.moving() if explains else self
 
     def unseen(self) -> Standing:
         """After a frame whose features are left out, as its images are earlier ones."""
@@ -187,39 +132,16 @@ class Standing:
 
     def moving(self) -> Standing:
         """The same features, of a camera that does not stand."""
-        return changed(self, frames=0, rest=None)
+        return changed(self, frames=0)
 
 
-def _ended(places: Places | None, T_world_left: Array) -> Rest | None:
-    """The rest at a pose (4, 4) that has just ended, perhaps."""
-    return None if places is None else Rest(places.select(places.sights >= _FRAMES), T_world_left)
-
-
-def _staying(
-    places: Places, variance: float, z: Array, seen: StereoFeatures, sigma: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Places whose features stay, rows of these features, and by how much they are off (M, 3) [px]."""
-    radius, none = SIGMAS * np.sqrt(2.0) * sigma, np.zeros((len(places.z), 2, 2))
-    # 0.5: largest distance of descriptors of one feature in unchanged light
-    near = Windows((1.0,), (0.5,), 1.0, radius, radius)
-    pairs = follow(places.z[:, :2], none, places.descriptors, places.laplacian, seen, near)
-    at, rows = pairs.tracks, pairs.features
-    shift = z[rows] - places.z[at]
-    stay = np.square(shift).sum(axis=1) <= _GATE * min(variance, 2.0 * sigma**2)
-    return at[stay], rows[stay], shift[stay]
-
-
-def _nearer(z: Array, some: NDArray[np.intp], others: NDArray[np.intp]) -> bool:
-    """Whether of features at `z` (N, 3) three of four in rows `some` are nearer than three of four `others`."""
-    disparity = z[:, 0] - z[:, 2]
-    return quantile(disparity[some], 0.25) > quantile(disparity[others], 0.75)
-
-
-def _moved(rig: StereoRig, sigma: float, before: Array, now: Array, motion: Array) -> BoolArray:
-    """Which features are not where a motion (4, 4) takes what was seen `before` (M, 3), but off by more than noise."""
-    local = rig.triangulate(before[:, :2], before[:, [2, 1]])
-    pixels, _ = rig.project_stereo(transform(motion, local), jacobian=False)
-    return np.asarray(((pixels - now) ** 2).sum(axis=1) > _GATE * 2.0 * sigma**2)
+def _moved(rig: StereoRig, sigma: float, features: StereoFeatures, rows: NDArray[np.intp], motion: Array) -> int:
+    """Number of some features that a motion (4, 4) of what they see would move by more than noise."""
+    local = rig.triangulate(features.uv_left[rows], features.uv_right[rows])
+    seen = np.isfinite(local).all(axis=1)
+    z = measurement_rows(features.uv_left[rows[seen]], features.uv_right[rows[seen]])
+    pixels, _ = rig.project_stereo(transform(motion, local[seen]), jacobian=False)
+    return int(np.count_nonzero(((pixels - z) ** 2).sum(axis=1) > _GATE * 2.0 * sigma**2))
 
 
 def _at_rest(rig: StereoRig, before: Array, d: Array, variance: float) -> tuple[bool, float]:

@@ -110,29 +110,6 @@ def test_a_truck_that_passes_does_not_take_the_camera_along(backend):
 
 
 @pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
-def test_a_body_that_fills_the_view_and_starts_slowly_takes_the_camera_along_for_some_frames_only(backend):
-    """It goes 1 px a frame at a depth of 4 m; 20 of 400 features are still."""
-    scene, off = Scene(0.95), []
-    system = slam.StereoSlam(RIG, backend=backend)
-    for k in range(30):
-        shift = np.array([0.013 * max(0, k - 9), 0.0, 0.0])
-        result = system.process_features(scene.seen(k, np.eye(4), shift))
-        off.append(float(np.linalg.norm(result.estimate.T_world_left[:3, 3])))
-    assert max(off[20:]) < 1e-2
-
-
-def test_what_is_fastened_to_a_camera_does_not_hold_it():
-    """Its bonnet stays in the image while it starts: it is nearer than all that moves."""
-    scene = Scene(0.95)
-    scene.points[~scene.body] *= 0.8 / scene.points[~scene.body, 2:]
-    system = slam.StereoSlam(RIG, backend="ekf")
-    for k in range(30):
-        shift = np.array([0.013 * max(0, k - 9), 0.0, 0.0])
-        result = system.process_features(scene.seen(k, np.eye(4), shift))
-    assert abs(result.estimate.T_world_left[0, 3] + shift[0]) < 2e-2
-
-
-@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 def test_a_standing_camera_does_not_believe_each_frame_for_itself(backend):
     """Light moves its features slowly and alike."""
     scene, found = Scene(0.0), []
