@@ -248,8 +248,7 @@ def measure(camera, T_world_left, position, anchor, measured, rows, slot, sigma,
             met = depth - r[2] * depth * depth / (right_fu * shift)  # on the ray uR changes by f' b / z
             if abs(r[2]) <= far:
                 break
-        scale = met if front else 0.0
-        place[0], place[1], place[2] = x * scale, y * scale, scale
+        place[0], place[1], place[2] = (x * met, y * met, met) if front else (0.0, 0.0, 0.0)
         transform(T_world_left, place, p[n, slot])
         dof[n, slot] = (3 if stereo else 2) if front else 0
         A[n, slot] = 0.0

@@ -101,6 +101,7 @@ class MomentWatch:
         (4, 4) takes this frame's camera coordinates to the other's. A right image from between them is off by a share
         of it.
         """
+        columns = columns.copy()
         with np.errstate(all="ignore"):
             columns[:, 1] = rows - self._rig.left.project(transform(T_other_now, points))[:, 1]
         columns = columns[np.isfinite(columns).all(axis=1) & (np.abs(columns[:, 1]) < _FLOW)]
