@@ -99,9 +99,8 @@ def _sum_areas(space, weights, descriptors, row):
 def describe(integral, uv, size, angle, excess, weights):
     """Descriptors (N, 16 or 64) float32 of features with pixels (N, 2), sizes (N,) [px], angles (N,) [rad], y down.
 
-    An angle that is NaN counts as 0.
     `integral` is of `integral_image`, `excess` how much wider than cells the boxes are that are averaged, in cells
-    (`TURNED_EXCESS` or `UPRIGHT_EXCESS`), `weights` are `gaussian_weights`.
+    (`TURNED_EXCESS` or `UPRIGHT_EXCESS`), `weights` are `gaussian_weights`. An angle that is NaN counts as 0.
     """
     rows, lanes = weights.shape
     out = np.zeros((len(uv), 4 * (rows // _SUB) ** 2), np.float32)

@@ -47,7 +47,7 @@ class Picture:
 
 
 class Sampler:
-    """Images (H, W) at fixed places, interpolated linearly: as ``cv2.remap`` with zero outside, in a third of the time.
+    """Images (H, W) at fixed places, interpolated linearly: as ``cv2.remap`` with zero outside, in half the time.
 
     Args:
         places: columns and rows (2, H, W) float32 of each sample.

@@ -12,8 +12,6 @@ from slam.kernels.linear import invert_symmetric, row_times, square, trace, turn
 from slam.kernels.se3 import point_by_motion, transform, transform_back
 from slam.runtime.compilation import helper, kernel
 
-# ---------------------------------------------------------------------------------------------- windows and bodies
-
 
 @helper
 def _mean(points, A, mean):

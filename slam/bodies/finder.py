@@ -118,7 +118,7 @@ def places_in_view(local: Array) -> Array:
 
 
 def limit(test: float, size: IndexArray | int) -> Any:
-    """χ²(6) from which a group of so many tracks moved: small groups have the heavier tails of single tracks."""
+    """χ²(6) from which a group of so many tracks (1 at least) moved: small ones have the heavier tails of tracks."""
     return test * (1.0 + _TAIL / size)
 
 
