@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-from functools import partial
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 import backends
 from backends.smoother.landmarks import SmootherLandmarks
-from experiments.long_run import Corridor
-from experiments.long_run import run as walk
 from slam.data import Observations
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
@@ -176,17 +171,6 @@ def test_at_rest_neither_the_pose_nor_its_covariance_changes_and_the_velocity_is
     assert len(backend.trajectory().stamps) == 7
 
 
-@pytest.mark.parametrize("name", ["ekf", "smoother", "window"])
-def test_a_walk_in_which_the_map_is_replaced_again_and_again(name):
-    """In short: nothing may decay or grow while landmarks come and go."""
-    checkpoints = list(walk(name, 60, 20, Corridor(density=4, speed=4.0)))
-    assert [c.frame for c in checkpoints] == [20, 40, 60]
-    for c in checkpoints:
-        assert c.failed == 0 and c.least > 0 and c.nees < 20
-        assert c.landmarks <= 4 * 8 + 4  # those of 24 m were in the map in all
-        assert c.error < 0.3  # of 24 m
-
-
 @pytest.mark.parametrize(
     ("name", "options", "seed"),
     [
@@ -225,52 +209,3 @@ def test_a_camera_that_turned_anyhow_in_the_dark_does_not_claim_to_know_where_it
         seen = observe(T, points, 0.5, rng, 20)
         step(backend, 0.1 * k, seen.select(np.full(len(seen), not 30 <= k < 30 + dark)), known)
         assert k < 30 + dark or nees(backend, T) < chi2.ppf(0.9999, 6)
-
-
-def interrupt(call, number: int) -> bool:
-    """Whether a call was interrupted at the `number`-th function called within the back ends."""
-    left = number
-
-    def profile(frame, event, _):
-        nonlocal left
-        if event == "call" and "backends/" in frame.f_code.co_filename.replace("\\", "/").split("tests")[0]:
-            left -= 1
-            if not left:
-                raise KeyboardInterrupt
-
-    before = sys.getprofile()
-    sys.setprofile(profile)
-    try:
-        call()
-    except KeyboardInterrupt:
-        return True
-    finally:
-        sys.setprofile(before)
-    return False
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # interrupted while a generator closes
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [("ekf", {}), ("iekf", {}), ("smoother", {"lag": None}), ("smoother", {"lag": 12}), ("window", {})],
-)
-def test_a_call_that_is_interrupted_did_not_happen(name, options):
-    """A KeyboardInterrupt at any function call within a back end: the same call again, and the run goes on."""
-    data = scene(path(20, 0.1, np.array([0.0, 0.0, 0.8]), np.array([0.0, 0.3, 0.0])), points=150)
-    models, rng, known, count = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5), np.random.default_rng(0), [], 0
-    often, plain = (backends.create(name, RIG, models=models, **options) for _ in range(2))
-    for k, (stamp, _, seen) in enumerate(data):
-        old = np.isin(seen.ids, known)
-        gone = rng.permutation(np.setdiff1d(known, seen.ids))[:3].astype(np.int64)
-        calls = ("predict", stamp), ("update", seen.select(old)), ("add", seen.select(~old)), ("remove", gone)
-        for method, argument in (*calls, ("estimate", True), ("revise", lambda z: z)):
-            for backend in (often, plain):
-                call = partial(getattr(backend, method), argument)
-                if backend is plain or k < 3 or interrupt(call, int(rng.integers(1, 60))):
-                    count += backend is often and k > 2
-                    call()
-        known = np.setdiff1d(np.union1d(known, seen.ids), gone)
-        assert len(often.trajectory()) == k + 1
-    assert count > 20
-    off = se3.log(se3.inverse(plain.trajectory().poses) @ often.trajectory().poses)
-    assert np.abs(off).max() < (0.01 if name == "smoother" else 1e-12)  # its graph was built anew, linearised elsewhere

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -97,16 +96,6 @@ def test_one_that_is_measured_again_is_new_to_the_camera(name):
     known = np.linalg.inv(U.T @ np.linalg.solve(E @ s.covariance.P @ E.T, U))
     way = s.covariance.drift(gauge_by_error(s.camera)) + s.drifts[gone.reference[half - 1]]
     assert half > 50 and np.linalg.eigvals(np.linalg.solve(way, known)).real.min() > 1.0
-
-
-@BOTH
-def test_the_drift_from_each_reference_pose_goes_on_with_the_later_ones(name):
-    """From the first one it is that of all the way, to the last one nothing yet."""
-    backend, *_ = swayed(name, 60, kept=KEPT)
-    drifts = backend.state.drifts
-    assert len(drifts) > 2 and not drifts[-1].any()
-    for earlier, later in pairwise(drifts):
-        assert np.linalg.eigvalsh(earlier - later).min() > -1e-12 and np.trace(earlier) > 1.01 * np.trace(later)
 
 
 def uncertain(backend, ids) -> np.ndarray:

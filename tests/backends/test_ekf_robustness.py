@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from scipy.stats import chi2
 import backends
 from backends.ekf import EkfBackend
 from backends.ekf.innovation import Correction, Linearisation
-from backends.ekf.solve import correction
 from backends.iekf import IekfBackend
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
@@ -199,12 +197,3 @@ def test_a_roll_in_one_step(make, degrees):
         assert report.status is UpdateStatus.OK and len(report.rejected) <= 1
         found.append(nees(backend, rolled))
     assert max(found) < chi2.ppf(0.9999, 6)
-
-
-def test_of_two_agreements_of_minorities_the_larger_counts(monkeypatch):
-    agreeing = iter([4, 1])
-    found = lambda _: SimpleNamespace(used=np.arange(12) < next(agreeing))  # noqa: E731
-    monkeypatch.setattr("backends.ekf.solve._plausible", found)
-    camera, covariance = SimpleNamespace(pose=np.eye(4), at=lambda T: T), SimpleNamespace(P=np.eye(3))
-    update = SimpleNamespace(camera=camera, covariance=covariance, z=np.zeros((12, 3)), linearised=lambda camera: None)
-    assert correction(update, np.eye(4), lambda: None).used.sum() == 4

@@ -10,7 +10,7 @@ import pytest
 import frontends
 from frontends.surf import SurfFrontend
 from frontends.surf.images import Sampler
-from frontends.surf.keypoints import adapted_threshold, spread
+from frontends.surf.keypoints import spread
 from slam.data import StereoFrame
 from slam.errors import SequenceError
 from slam.interfaces import Frontend
@@ -145,13 +145,6 @@ def test_threshold_keeps_the_number_of_features():
 def test_unusable_images(left, right, says):
     with pytest.raises(SequenceError, match=says):
         SurfFrontend(RIG).extract(StereoFrame(7, 0.0, left, right))
-
-
-def test_limits_hold():
-    assert adapted_threshold(10, 0, 100, 5, 1000) == 5
-    assert adapted_threshold(900, 10_000, 100, 5, 1000) == 1000
-    assert adapted_threshold(0.0, 10_000, 100, 0, 1000) > 0
-    assert [adapted_threshold(300, count, 1000, 5, 1000) for count in (1100, 900)] == [300, 300]
 
 
 def test_no_cell_takes_all():

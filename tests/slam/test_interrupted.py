@@ -102,18 +102,6 @@ def test_interrupted_at_any_line_the_next_frames_are_tracked(backend):
     assert np.linalg.norm(trajectory.positions - true, axis=1).max() < 0.03
 
 
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
-def test_interrupted_where_a_body_moves(backend):
-    sequence = slam.open_sequence("synthetic:box?density=300")
-    system = StereoSlam(sequence.rig, None, backend)
-    frames = (sequence.observations(k) for k in range(58, 300))
-    while not system.process_features(next(frames)).objects:
-        pass
-    assert interrupted(system, next(frames), 100)
-    assert system.process_features(next(frames)).objects  # interrupted elsewhere, the detector goes on
-    interrupt_often(system, frames, 5)
-
-
 @pytest.mark.parametrize("case", [*BACKENDS, "in a map"])
 def test_the_step_that_starts_or_finds_the_camera_in_a_map_may_be_interrupted(case):
     cloud, counter, hits = Cloud(150), Lines(), 0

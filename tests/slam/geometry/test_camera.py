@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.geometry.camera import PinholeCamera, oblong, size_doubt
+from slam.geometry.camera import PinholeCamera
 
 CAMERAS = {
     "ideal": PinholeCamera(260, 255, 160, 118, 320, 240),
@@ -59,20 +59,3 @@ def test_far_rays_are_not_folded_back_into_the_image():
     inside = camera.in_image(uv)
     assert inside[0]
     assert not inside[np.argmin(inside) :].any()  # once out of the image, never in again
-
-
-@pytest.mark.parametrize(("x", "y", "doubted"), [(1.06, 1.07, False), (1.25, 1.25, True), (0.75, 0.75, True)])
-def test_a_principal_point_is_doubted_from_another_size_on_and_not_by_its_usual_scatter(x, y, doubted):
-    camera = PinholeCamera(450, 450, x * 319.5, y * 239.5, 640, 480)
-    assert bool(size_doubt(camera, camera)) == doubted
-
-
-@pytest.mark.parametrize(
-    ("fv", "x", "y", "words"),
-    [(450, 1.0, 1.12, "height"), (450, 1.12, 1.0, "width"), (410, 1.0, 1.0, "focal lengths along rows"),
-     (450, 0.98, 0.924, ""), (450, 1.12, 1.12, "")],
-)  # fmt: skip
-def test_images_scaled_in_one_way_alone_are_asked_for(fv, x, y, words):
-    """By the pixels' shape, or by the principal point along one axis: 8 % off it is in recordings that are right."""
-    camera = PinholeCamera(450, fv, x * 319.5, y * 239.5, 640, 480)
-    assert words in oblong(camera, camera) and bool(words) == bool(oblong(camera, camera))

@@ -17,7 +17,7 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp
 from slam.input import warnings
-from slam.input.moment import MomentWatch, _lags
+from slam.input.moment import MomentWatch
 from slam.input.pair import PairGeometry, pair_geometry, points_of, share_shown
 from slam.input.warnings import InputWarnings
 from slam.models import models_for
@@ -402,12 +402,3 @@ def test_a_camera_that_hardly_moves_shows_no_lag():
     """Its rows, here off by the lens, and the flow by errors of its poses are alike in all frames."""
     step = np.array([1e-5, 0, 0, 0, 0, 0])
     assert doubt(0.0, lambda rng: step, ([-2, -1.5, 3], [2, 1.5, 9]), 31, lambda x, y: y * y) == ""
-
-
-@pytest.mark.parametrize(("flow", "lag"), [(1.0, 0.5), (0.03, 0.0)])
-def test_a_lag_counts_only_where_the_motion_moves_rows(flow, lag):
-    """A board that moves before a standing camera was taken for right images of another moment."""
-    columns = np.random.default_rng(0).normal(size=(8, 2, 50, 7)) * [0.1 * flow, flow, 1, 1, 1, 1, 1]
-    columns[..., 0] -= 0.5 * columns[..., 1]
-    sums = np.swapaxes(columns, 2, 3) @ columns
-    np.testing.assert_allclose(_lags(sums, sums.sum(axis=0), 0.2), lag, atol=0.02)

@@ -11,7 +11,7 @@ from experiments.simulated_recording import true_recording
 from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.config import SystemConfig
 from slam.data import FrameStatus
-from slam.errors import MeasurementError, SequenceError
+from slam.errors import SequenceError
 from slam.run.recording import RecordedFrame, Recording, load_recording, save_recording
 from slam.run.replay import Replay
 from slam.system import StereoSlam
@@ -144,9 +144,3 @@ def test_damaged_files_are_refused_in_one_line(recording, tmp_path, fault):
     with pytest.raises(SequenceError, match=words) as caught:
         load_recording(tmp_path / "bad.npz")
     assert "bad.npz" in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_recordings_are_checked_when_made(recording):
-    first, *others = recording.frames
-    with pytest.raises(MeasurementError, match="is removed but not in the map"):
-        replace(recording, frames=(replace(first, removed=np.array([10**6])), *others))

@@ -7,7 +7,7 @@ import pytest
 from slam.compare.plan import Plan, Trial
 from slam.compare.tables import groups, honesty
 from slam.compare.trial import Run
-from slam.run.results import errors_of_truth, facts, figures, rows, verdict, verdict_of_run
+from slam.run.results import errors_of_truth, figures, verdict, verdict_of_run
 
 TEN, ONE, START, HUNDRED = "ratio_10m", "ratio_1m", "ratio_start", "ratio_100m"
 
@@ -101,22 +101,3 @@ def test_figures_of_bodies_are_means_over_those_that_were_in_view():
     assert found["body_coverage"] == pytest.approx(0.6) and found["body_ratio"] == pytest.approx(2.0**0.5)
     assert found["moving_precision"] == 0.5
     assert "moving_precision" not in figures(summary(1.0) | {"objects": {"features": {"precision": 0.5}, "bodies": {}}})
-
-
-@pytest.mark.parametrize(
-    ("format", "translation", "words"),
-    [("folders", 0.0, "none, it is taken as exact"), ("folders", 2e-3, "σ 2 mm, 0°"), ("synthetic", 0.0, "")],
-)
-def test_errors_of_the_truth_are_said_in_sentence_table_and_head_and_a_wrong_one_judges_nothing(
-    format, translation, words
-):
-    given = summary(1.0) | {"format": format, "truth": {"rotation": 0.0, "translation": translation}}
-    assert dict(rows([given])).get("errors of the true path itself") == ([words] if words else None)
-    for said in (verdict_of_run(given), facts(given)):
-        assert words in said and ("true path" in said) == bool(words)
-    assert ("truth_sigma=" in verdict_of_run(given)) == words.startswith("none")
-    assert "truth_sigma=" not in verdict_of_run(given | {"format": "recording"})  # which has no options
-    for length, said in ((0.0084, "8.4 mm"), (0.84, "0.84 m")):
-        assert f"path length {said}" in facts(given | {"path_length_m": length})
-    wrong = given | {"consistency": {}, "truth_doubt": "it is in mm"}
-    assert verdict_of_run(wrong).startswith("covariances are not judged: the true path")

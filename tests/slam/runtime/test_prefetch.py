@@ -5,11 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-import time
 
 import pytest
 
-from slam.runtime.threads import free_cores, prefetch
+from slam.runtime.threads import prefetch
 
 
 def threads() -> set[threading.Thread]:
@@ -30,26 +29,6 @@ def test_items_are_made_while_the_one_before_is_used_and_no_more_than_asked_for(
     assert next(work) == 0 and third.wait(10) and len(made) <= 5
     work.close()
     assert threads() <= before
-
-
-def test_what_is_made_ahead_leaves_a_core_to_a_busy_user(monkeypatch):
-    monkeypatch.setattr("slam.runtime.threads.available_cores", lambda: 4)
-    use, made = threading.Event(), []
-
-    def items():
-        made.append(free_cores())
-        yield
-        assert use.wait(10)
-        made.append(free_cores())
-        use.clear()
-        yield
-
-    for _ in prefetch(items()):
-        if len(made) == 1:
-            use.set()
-            while len(made) == 1:
-                time.sleep(0.01)
-    assert made == [4, 3] and free_cores() == 4
 
 
 def test_an_exception_comes_where_its_item_would():

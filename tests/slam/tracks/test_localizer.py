@@ -119,19 +119,6 @@ def right_share(results, points):
     return right / total
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_two_seconds_of_blackout(backend):
-    poses = path(95)
-    system, results, points = run(backend, poses, range(20, 80))
-    lost = CONFIG.map.lost_after - 1
-    dark = [("predicted", lost), ("lost", 60 - lost)]
-    assert states(results) == [("started", 1), ("tracked", 19), *dark, ("tracked", 15)]
-    assert not any(len(r.added) for r in results[20:80])
-    assert right_share(results, points) == 1
-    assert np.linalg.norm(system.trajectory().positions[-1] - poses[-1][:3, 3]) < 0.012
-
-
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_carried_camera_is_believed_when_three_frames_agree(backend):
     """The way it was carried is no motion: the back end begins again in the map, and the path keeps every frame."""

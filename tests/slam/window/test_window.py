@@ -294,17 +294,6 @@ def test_the_prior_does_not_mind_where_all_stands():
     assert cost(moved) == pytest.approx(cost(here), abs=1e-6)
 
 
-def test_a_solution_says_whether_it_was_reached():
-    assert solver.solve(window(off=0.3)).converged
-    assert not solver.solve(window(off=0.3), steps=1).converged
-
-
-def test_what_nothing_determines_is_refused():
-    w = window(prior=RelativePrior.none())
-    with pytest.raises(np.linalg.LinAlgError):
-        solve(replace(w, rows=w.rows.select(w.rows.pose != 2)))
-
-
 def test_what_is_refused_leaves_nothing_in_memory():
     """An exception inside a kernel would: all of its arrays, megabytes for each window that is not determined."""
     w = window(prior=RelativePrior.none())

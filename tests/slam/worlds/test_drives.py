@@ -12,7 +12,7 @@ from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
 from slam.sequences import open_sequence
 from slam.worlds import WorldSequence, open_world
-from slam.worlds.drives import SAME_ROAD, STEP, Road, read_path, sampled
+from slam.worlds.drives import read_path, sampled
 from slam.worlds.paths import camera_poses
 
 
@@ -58,16 +58,6 @@ def test_poses_stay_as_they_are_at_the_usual_rate_and_lie_between_them_at_anothe
     assert np.allclose(sampled(path, {**usual, "rate": 20.0}).positions[:, 1], np.arange(59) / 2)
     fast = sampled(path, {**usual, "speed": 2.0})
     assert np.allclose(fast.stamps, np.arange(15) / 10) and np.allclose(fast.positions[:, 1], 2 * np.arange(15))
-
-
-def test_a_road_driven_again_counts_once():
-    there = np.column_stack([np.zeros(101), np.arange(101.0), np.zeros(101)])
-    once = Road.along(there)
-    assert np.ptp(once.way) == pytest.approx(100 + 2 * 60, abs=3 * STEP)
-    assert np.allclose(once.left[50], (-1, 0), atol=1e-6)
-    back, aside = (np.concatenate([there, np.add(there[::-1], (x, 0, 0))]) for x in (SAME_ROAD - 1, 2 * SAME_ROAD))
-    assert len(Road.along(back).xy) < 1.1 * len(once.xy) + 20
-    assert len(Road.along(aside).xy) > 1.4 * len(once.xy)
 
 
 LAP = 450  # frames of a round in `loop`
