@@ -138,10 +138,7 @@ def main() -> int:
     seeds, frames, wrong = arguments.seeds, arguments.frames, arguments.wrong
     if arguments.quick:
         seeds, frames, wrong = 2, 15, 1
-    results = {}
-    for case in arguments.cases:
-        results[case] = trials(case, seeds, frames, wrong)
-        print(f"{case} done:\n{report({case: results[case]})}", file=sys.stderr, flush=True)
+    results = trials(arguments.cases, seeds, frames, wrong)
     print(f"{seeds} runs of {frames} frames; wrong matches in {min(wrong, seeds)} of them\n\n" + report(results))
     draw(arguments.out / "consistency.png", results)
     return 0

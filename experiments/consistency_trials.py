@@ -6,6 +6,7 @@ prior about the true one.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -133,8 +134,8 @@ def _all_seen(observed: Observations, added: Observations) -> Observations:
     return Observations(*parts)
 
 
-def trials(case: str, seeds: int, frames: int, wrong: int) -> list[Trial]:
-    """All seeds of a case, two at a time; the first `wrong` of them with wrong matches, too."""
+def trials(cases: Sequence[str], seeds: int, frames: int, wrong: int) -> dict[str, list[Trial]]:
+    """All seeds of each case, two at a time; the first `wrong` of them with wrong matches, too."""
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        jobs = [pool.submit(trial, case, seed, frames, seed < wrong) for seed in range(seeds)]
-        return [job.result() for job in jobs]
+        jobs = {case: [pool.submit(trial, case, k, frames, k < wrong) for k in range(seeds)] for case in cases}
+        return {case: [job.result() for job in own] for case, own in jobs.items()}

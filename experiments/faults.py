@@ -50,7 +50,7 @@ class Fault:
 
 def faults(quick: bool) -> list[Fault]:
     """The recordings; frame numbers are in the recording, after any are dropped."""
-    n, dark = (18, 14) if quick else (120, 60)
+    n, dark = (14, 10) if quick else (120, 60)
     rng = np.random.default_rng(0)  # frame 0 keeps its right image: without it there is no map that could be kept
     chosen = ",".join(str(k) for k in range(1, 2 * n) if rng.random() < 0.3)
     every = [
@@ -61,7 +61,7 @@ def faults(quick: bool) -> list[Fault]:
         Fault("kidnapped to a known place", "frames=900", n - 1, n, (n, 2 if quick else 30)),
         Fault("kidnapped to an unknown place", "frames=900", n - 1, n, (n, 450)),
     ]
-    return [every[1], every[3], every[4]] if quick else every
+    return [every[1], every[4]] if quick else every
 
 
 def frames(fault: Fault, count: int) -> Iterator[tuple[int, StereoFrame]]:
@@ -119,7 +119,7 @@ def draw(errors: dict[tuple[Fault, str], list[float]], path: Path) -> None:
         axes = np.ravel(panels)
         for axis, fault in zip(axes, names):
             axis.axvspan(fault.last_good, fault.over, color="0.85")
-            for backend in ONLINE:
+            for backend in (name for other, name in errors if other == fault):
                 axis.semilogy(np.maximum(errors[fault, backend], 1e-2), lw=1, label=backend)
             axis.set_title(fault.name, fontsize=9)
             axis.set(xlabel="frame", ylabel="error [cm]")
@@ -129,12 +129,12 @@ def draw(errors: dict[tuple[Fault, str], list[float]], path: Path) -> None:
 
 
 def main() -> int:
-    parser = script_options(__file__, __doc__, "three of the faults, shorter recordings")
+    parser = script_options(__file__, __doc__, "two of the faults, shorter recordings, one back end")
     arguments = parser.parse_args()
     rows, errors = [], {}
     for fault in faults(arguments.quick):
-        features = extract(fault, 42 if arguments.quick else 300)
-        for backend in ONLINE:
+        features = extract(fault, 30 if arguments.quick else 300)
+        for backend in ONLINE[: 1 if arguments.quick else None]:
             row, errors[fault, backend] = run(fault, backend, features)
             rows.append(row)
             print(row, file=sys.stderr, flush=True)

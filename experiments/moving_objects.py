@@ -62,6 +62,11 @@ ONE_FOR_ALL = ("back end", "cyclist", f"frames within {NEAR:.0f} m")  # cells th
 # ------------------------------------------------------------------------------------------- the parts
 
 
+def backends_of(quick: bool) -> tuple[str, ...]:
+    """All back ends, or one: what a part does with them is the same."""
+    return BACKENDS[: 1 if quick else None]
+
+
 def body_alignment(estimated: Array, true: Array) -> Array:
     """The change D (4, 4) of body frame with ``T_true ≈ T_estimated D`` over all rows, in the mean."""
     D = inverse(estimated) @ true
@@ -90,7 +95,7 @@ def table1(quick: bool, out: Path) -> list[dict[str, Any]]:
         known = [f"objects.database={database}", "objects.mode=procedure1"]
         systems = [
             (backend, mode, system_for(sequence, backend, settings))
-            for backend in BACKENDS
+            for backend in backends_of(quick)
             for mode, settings in (("detect", []), ("procedure1", known))
         ]
     for backend, mode, system in systems:
@@ -136,7 +141,7 @@ def moving(quick: bool, out: Path) -> list[dict[str, Any]]:
     """The box under a moving camera: with, and without the box's features."""
     name, frames = "box?density=300&camera=moving&seed=0", 80 if quick else 10**6
     rows, scores = [], {}
-    for backend in BACKENDS:
+    for backend in backends_of(quick):
         row, scores[backend] = scored_run(name, backend, frames)
         sequence = slam.open_sequence(f"synthetic:{name}")
         system = system_for(sequence, backend, ["objects.mode=off"])
@@ -166,14 +171,14 @@ def boxes(quick: bool, out: Path) -> list[dict[str, Any]]:
     """Four boxes: three, and one with a lid on a hinge; three rooms."""
     frames, seeds = (20, 1) if quick else (300, 3)
     worlds = [f"boxes?density=300&seed={seed}&layout={seed}" for seed in range(seeds)]
-    return [scored_run(world, backend, frames)[0] for world in worlds for backend in BACKENDS]
+    return [scored_run(world, backend, frames)[0] for world in worlds for backend in backends_of(quick)]
 
 
 def occlusion(quick: bool, out: Path) -> list[dict[str, Any]]:
     """The box is hidden: how often it keeps its id, of ten runs."""
     found: dict[tuple[str, int], list[tuple[set[int], set[int], int]]] = {}
-    hidden_for, backends = (HIDDEN_FOR[:1], BACKENDS[:1]) if quick else (HIDDEN_FOR, BACKENDS)
-    for seed, frames, backend in product(range(1 if quick else 10), hidden_for, backends):
+    hidden_for = HIDDEN_FOR[: 1 if quick else None]
+    for seed, frames, backend in product(range(1 if quick else 10), hidden_for, backends_of(quick)):
         found.setdefault((backend, frames), []).append(ids_about(seed, backend, frames, max(hidden_for)))
     return [
         {
@@ -215,7 +220,7 @@ def still(quick: bool, out: Path) -> list[dict[str, Any]]:
 
 def people(quick: bool, out: Path) -> list[dict[str, Any]]:
     """Cyclists and walkers: nothing in the detector was chosen on this world."""
-    return [scored_run("people?", backend, 8 if quick else 10**6)[0] for backend in BACKENDS]
+    return [scored_run("people?", backend, 8 if quick else 10**6)[0] for backend in backends_of(quick)]
 
 
 def kitti(quick: bool, out: Path) -> list[dict[str, Any]]:
@@ -230,7 +235,7 @@ def kitti(quick: bool, out: Path) -> list[dict[str, Any]]:
     features = [system.frontend.extract(frame) for frame in sequence.frames(0, frames)]
     clear = [f.select(~hidden(f, labels.get(k, {}), MOVING_CARS)) for k, f in enumerate(features)]
     rows = []
-    for backend in BACKENDS:
+    for backend in backends_of(quick):
         results = drive(sequence, backend, features)
         rows += car_rows(backend, results, labels)
         paths = {
@@ -263,7 +268,7 @@ def cyclists(quick: bool, out: Path) -> list[dict[str, Any]]:
     system = system_for(sequence, "ekf", [])
     features = [system.frontend.extract(frame) for frame in sequence.frames(0, 12 if quick else len(sequence))]
     rows = []
-    for backend in BACKENDS:
+    for backend in backends_of(quick):
         runs = [
             cyclist_rows(backend, drive(sequence, backend, features[first:]), first, labels, sequence.rig)
             for first in STARTS[: 1 if quick else None]

@@ -89,7 +89,7 @@ def true_path(folder: Path, estimate: Trajectory) -> np.ndarray | None:
 
 
 def main() -> int:
-    parser = script_options(__file__, __doc__, "ten frames of each sequence")
+    parser = script_options(__file__, __doc__, "six frames of two sequences")
     arguments = parser.parse_args()
     found = recordings(SEQUENCES)
     if not found:
@@ -97,7 +97,7 @@ def main() -> int:
         return 0
     if len(found) < len(SEQUENCES):
         print(f"left out, not there: {', '.join(sorted(set(SEQUENCES) - set(found)))}", file=sys.stderr)
-    frames = 10 if arguments.quick else None
+    found, frames = (dict(list(found.items())[::3]), 6) if arguments.quick else (found, None)
     rows = [row(n, run_one(n, folder, b, arguments.out, frames)) for n, folder in found.items() for b in ONLINE]
     show(arguments.out / "table.json", HEADER, rows, 2)
     draw(found, arguments.out)

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 import slam
-from slam.geometry.trajectory import Trajectory
 from slam.worlds.export import write_euroc
 from tests.recordings import write_opencv, write_video
 from tests.scripts import command
+from tests.slam.numeric import straight
 from tests.test_docs import DOCS, PAGES, ROOT, blocks, commands
 
 pytestmark = pytest.mark.slow
@@ -66,9 +66,7 @@ def reader(tmp_path_factory):
     for name in ("pose_fit.py", "orb_front.py"):
         shutil.copy(DOCS / "examples" / name, root)
     (root / "poses").mkdir()
-    straight = np.tile(np.eye(4), (60, 1, 1))
-    straight[:, 2, 3] = np.arange(60)
-    Trajectory(0.1 * np.arange(60), straight).write_kitti(root / "poses" / "00.txt")
+    straight(60).write_kitti(root / "poses" / "00.txt")
     return root
 
 

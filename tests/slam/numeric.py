@@ -1,4 +1,4 @@
-"""Numerical derivatives, the rounding of matrices, and paths of steps, for the tests."""
+"""Numerical derivatives, the rounding of matrices, and simple paths, for the tests."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable
 from itertools import accumulate
 
 import numpy as np
+
+from slam.geometry.trajectory import Trajectory
 
 
 def jacobian(function: Callable, x: np.ndarray, step: float = 1e-6) -> np.ndarray:
@@ -22,6 +24,13 @@ def jacobian(function: Callable, x: np.ndarray, step: float = 1e-6) -> np.ndarra
 def chained(steps: Iterable[np.ndarray]) -> np.ndarray:
     """Poses (N + 1, 4, 4) from the origin on, a step (4, 4) from each to the next."""
     return np.array(list(accumulate(steps, np.matmul, initial=np.eye(4))))
+
+
+def straight(count: int, step: float = 1.0, dt: float = 0.1) -> Trajectory:
+    """So many poses straight on, a step [m] forward every `dt` [s]."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 2, 3] = step * np.arange(count)
+    return Trajectory(dt * np.arange(count), poses)
 
 
 def assert_equal_to_rounding(found: np.ndarray, expected: np.ndarray, steps: int = 1) -> None:

@@ -120,11 +120,6 @@ def test_everything_comes_back(before: SavedMap, tmp_path):
     assert len(after.loops) == len(before.loops)
 
 
-def test_new_landmarks_get_ids_that_no_keyframe_has():
-    assert saved(KEYFRAMES).next_id == 7
-    assert saved(()).next_id == 1
-
-
 @pytest.mark.parametrize(("name", "value"), [
     ("ids", np.zeros(2, np.int64)),
     ("positions", np.full((1, 3), 1e300)),

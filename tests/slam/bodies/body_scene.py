@@ -11,7 +11,7 @@ import backends
 from slam.bodies.belief import BodyBelief
 from slam.bodies.estimator import FRAMES, BodyEstimator
 from slam.data import Observations
-from slam.evaluation.metrics import nees
+from slam.evaluation.metrics import PathErrors, error_sizes, nees
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
@@ -169,40 +169,33 @@ class Outcome:
     """A body's estimates against the truth, a row a frame after the first.
 
     Attributes:
-        rotation, translation: error of the pose [deg], [m]; its frame was put before the true camera at first sight.
+        pose: error of the pose; its frame was put before the true camera at first sight.
+        motion: error of the motion since the frame before (ME).
         pose_nees, velocity_nees: (F,).
-        motion_rotation, motion_translation: error of the motion since the frame before (ME) [deg], [m].
         estimates: all of them.
     """
 
-    rotation: Array
-    translation: Array
+    pose: PathErrors
+    motion: PathErrors
     pose_nees: Array
     velocity_nees: Array
-    motion_rotation: Array
-    motion_translation: Array
     estimates: list[ObjectEstimate]
 
 
 def score(scene: BodyScene, found: list[tuple[int, BodyBelief, Array]]) -> Outcome:
     """Judge the estimates of one body, the first of which is that of its first sight."""
-    first, belief, T_world_left = found[0]
-    before = belief.estimate.T_world_object
-    origin = scene.camera[first] @ se3.inverse(T_world_left) @ before  # where the frame truly is
-    true = scene.body @ se3.inverse(scene.body[first]) @ origin
-    errors, off, steps = [], [], []
-    for k, belief, _ in found[1:]:
-        e, dt = belief.estimate, scene.stamps[k] - scene.stamps[k - 1]
-        errors.append(se3.log(se3.inverse(e.T_world_object) @ true[k]))
-        w = se3.so3_log(true[k, :3, :3] @ true[k - 1, :3, :3].T) / dt
-        off.append(np.concatenate([w, (true[k, :3, 3] - true[k - 1, :3, 3]) / dt]) - e.velocity)
-        step = se3.inverse(before) @ e.T_world_object
-        steps.append(se3.log(se3.inverse(step) @ se3.inverse(true[k - 1]) @ true[k]))
-        before = e.T_world_object
-    x, s, estimates = np.array(errors), np.array(steps), [b.estimate for _, b, _ in found]
+    frames, estimates = [k for k, _, _ in found], [belief.estimate for _, belief, _ in found]
+    own = np.array([e.T_world_object for e in estimates])
+    body, camera = scene.body[frames], scene.camera[frames[0]]
+    true = body @ se3.inverse(body[0]) @ camera @ se3.inverse(found[0][2]) @ own[0]
+    rates = np.array([e.velocity for e in estimates[1:]])
+    E, steps = se3.inverse(own[1:]) @ true[1:], [se3.inverse(T[:-1]) @ T[1:] for T in (own, true)]
+    turns = se3.so3_log(true[1:, :3, :3] @ np.swapaxes(true[:-1, :3, :3], 1, 2))
+    moved = np.concatenate([turns, np.diff(true[:, :3, 3], axis=0)], axis=1)
+    velocities = moved / np.diff(scene.stamps[frames])[:, None]
     return Outcome(
-        np.degrees(np.linalg.norm(x[:, :3], axis=1)), np.linalg.norm(x[:, 3:], axis=1),
-        nees(x, np.array([e.covariance for e in estimates[1:]])),
-        nees(np.array(off), np.array([e.velocity_covariance for e in estimates[1:]])),
-        np.degrees(np.linalg.norm(s[:, :3], axis=1)), np.linalg.norm(s[:, 3:], axis=1), estimates,
+        error_sizes(E), error_sizes(se3.inverse(steps[0]) @ steps[1]),
+        nees(se3.log(E), np.array([e.covariance for e in estimates[1:]])),
+        nees(velocities - rates, np.array([e.velocity_covariance for e in estimates[1:]])),
+        estimates,
     )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slam.bodies.belief import EVEN, when_measured, when_missed
-from slam.bodies.bodies import PROOF, hidden, new_body, reported, with_evidence
+from slam.bodies.bodies import PROOF, hidden, new_body, reported
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.detector import MovingObjectDetector
 from slam.data import Estimate, StereoFeatures
@@ -35,13 +35,6 @@ def test_a_body_is_predicted_by_its_own_motion_model() -> None:
     grown = np.diag(detector.bodies[1].covariance - body.covariance)
     np.testing.assert_allclose(grown, dt**3 * np.array([0.5] * 3 + [2.0] * 3) ** 2, rtol=1e-9)
     np.testing.assert_allclose(detector.bodies[1].T[:3, 3], [dt, 0, 3.0])
-
-
-def test_a_body_exists_the_less_surely_the_longer_it_is_not_measured():
-    body = new_body(1, np.zeros(3), np.zeros(6), np.zeros(4), 0.0, 0.1)
-    for k in range(3):
-        later = with_evidence(replace(body, measured=False, existence=0.9 - 0.1 * k), 0.0, 0, 0)
-        assert later.existence < 0.9 - 0.1 * k
 
 
 def test_points_behind_a_body_are_hidden_and_no_others():

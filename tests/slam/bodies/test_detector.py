@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 import slam
-from slam.bodies.config import WINDOW, ObjectsConfig
+from slam.bodies.config import WINDOW
 from slam.config import SystemConfig
-from slam.errors import ConfigurationError
 from slam.evaluation.objects import score_for
 
 
@@ -90,12 +89,6 @@ def test_nothing_moves_in_a_still_world():
         flagged, count = flagged + len(result.moving_features), count + len(result.features)
         assert not result.objects
     assert flagged <= 0.002 * count
-
-
-@pytest.mark.parametrize("wrong", [{"mode": "neural"}, {"mode": "procedure1"}, {"max_speed": 0.0}, {"suspect": 0.0}])
-def test_settings_are_checked(wrong):
-    with pytest.raises(ConfigurationError):
-        ObjectsConfig(**wrong)
 
 
 def test_landmarks_that_were_lost_from_view_are_followed_again_once_they_are_found():

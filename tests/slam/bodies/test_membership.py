@@ -14,10 +14,10 @@ from slam.bodies.bodies import PROOF, Body, continued, new_body, with_evidence, 
 from slam.bodies.config import CLEAR, ObjectsConfig
 from slam.bodies.fits import fit_positions
 from slam.bodies.membership import merge
-from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, transform
 from slam.tracks.table import Tracks
+from tests.slam.scene import features_at
 
 WINDOW = 12
 SLOT = WINDOW - 1
@@ -30,10 +30,7 @@ TIMES = (np.arange(WINDOW) - SLOT) / 30.0
 def table(seen: Array) -> Tracks:
     """Tracks that measured the points (N, W, 3) in world coordinates, one slot a frame."""
     n = len(seen)
-    features = StereoFeatures(
-        0.0, np.zeros((n, 2)), np.zeros((n, 2)), np.ones(n), np.zeros(n), np.ones(n), np.ones(n, np.int8),
-        np.zeros((n, 16), np.float32), (320, 240),
-    )  # fmt: skip
+    features = features_at(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 16), np.float32))
     tracks, rows = Tracks.empty(16, WINDOW), np.arange(n)
     tracks.row[rows] = rows
     tracks.begin(rows, rows, features, seen[:, 0])
@@ -45,11 +42,8 @@ def table(seen: Array) -> Tracks:
 
 def enter(tracks: Tracks, rows: Array, slot: int, points: Array) -> None:
     """Tracks measured points in a slot."""
-    tracks.p[rows, slot], tracks.A[rows, slot], tracks.dof[rows, slot] = (
-        points - tracks.anchor[rows],
-        np.eye(3) / SIGMA**2,
-        3,
-    )
+    tracks.p[rows, slot] = points - tracks.anchor[rows]
+    tracks.A[rows, slot], tracks.dof[rows, slot] = np.eye(3) / SIGMA**2, 3
 
 
 def path(velocity: Array) -> Array:

@@ -12,11 +12,10 @@ from slam.bodies.detector import MovingObjectDetector
 from slam.bodies.fits import fit_positions, record
 from slam.bodies.frame import Frame
 from slam.config import SystemConfig
-from slam.data import StereoFeatures
 from slam.geometry.se3 import exp, inverse, log
 from slam.models import EstimatorModels
 from slam.tracks.table import Tracks
-from tests.slam.scene import RIG
+from tests.slam.scene import RIG, features_at
 
 SIGMA = 0.3  # pixel noise [px]; the detector is told one pixel
 FRAMES = WINDOW
@@ -24,20 +23,16 @@ IDENTITY = np.eye(4)
 TIMES, POSES = np.zeros(WINDOW), np.tile(IDENTITY, (WINDOW, 1, 1))
 
 
+def features_of(z):
+    """Features at pixels (uL, vL, uR) (N, 3)."""
+    right = np.where(np.isnan(z[:, 2:]), np.nan, z[:, [2, 1]])
+    return features_at(z[:, :2], right, np.eye(len(z), 16, dtype=np.float32))
+
+
 def seen(points, rng):
     """Pixels (uL, vL, uR) (N, 3) of points (N, 3) to a camera at the origin."""
     left, right = RIG.project(points)
     return np.column_stack([left, right[:, 0]]) + SIGMA * rng.standard_normal((len(points), 3))
-
-
-def features_at(z):
-    """Features at pixels (uL, vL, uR) (N, 3)."""
-    n, right = len(z), np.column_stack([z[:, 2], z[:, 1]])
-    right[np.isnan(z[:, 2])] = np.nan
-    return StereoFeatures(
-        0.0, z[:, :2], right, np.full(n, 12.0), np.zeros(n), np.ones(n), np.ones(n, np.int8),
-        np.eye(n, 16, dtype=np.float32),
-    )  # fmt: skip
 
 
 class Room:
@@ -57,10 +52,10 @@ class Room:
         self.detector = MovingObjectDetector(RIG, ObjectsConfig(), EstimatorModels())
         self.tracks = tracks = Tracks.empty(16, WINDOW, count)
         tracks.ids[:] = tracks.row[:] = self.ids
-        tracks.begin(self.ids, self.ids, features_at(np.zeros((count, 3))), self.points)
+        tracks.begin(self.ids, self.ids, features_of(np.zeros((count, 3))), self.points)
         for frame in range(frames):
             known = self.ids[(self.ids != near - 1) | (frame > frames - 3)]
-            features = features_at(seen(self.points, rng))
+            features = features_of(seen(self.points, rng))
             record(tracks, known, Frame(self.detector.setup, frame, features, self.points, TIMES, POSES, None))
         fit_positions(tracks, self.ids)
         self.detector._number = frames - 1
@@ -74,7 +69,7 @@ class Room:
         z = seen(points, self.rng)
         z[list(monocular), 2] = np.nan
         z[np.ix_(alone, [0, 2])] += 8.0
-        found = self.detector.parting(self.tracks, features_at(z), self.ids, self.ids, T_world_left)
+        found = self.detector.parting(self.tracks, features_of(z), self.ids, self.ids, T_world_left)
         return np.isin(self.ids, found)
 
 

@@ -88,12 +88,6 @@ def test_few_points_move_a_body_but_do_not_turn_it_wildly(seen):
     assert np.degrees(np.arccos((np.trace(T[:3, :3]) - 1) / 2)) < 3.0
 
 
-def test_points_that_do_not_agree_say_nothing():
-    body, tracks, features, _ = scene(3, np.zeros(6), np.random.default_rng(5))
-    features.uv_left[:2] += [[40.0], [-40.0]]
-    assert place(body, tracks, features) is None
-
-
 @pytest.mark.parametrize(
     ("seen", "deviation", "turn", "measured"),
     [(2, 0.5, 0.05, True), (2, 0.5, 1.0, False), (3, 0.5, 1.0, True), (3, 2.0, 0.05, False), (4, 2.0, 0.05, True)],

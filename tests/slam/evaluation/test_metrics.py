@@ -12,7 +12,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from slam.evaluation.metrics import PathErrors, absolute_errors, associate, relative_errors, segment_errors
 from slam.geometry.se3 import exp, inverse, is_rotation
 from slam.geometry.trajectory import Trajectory, alignment
-from tests.slam.numeric import chained
+from tests.slam.numeric import chained, straight
 
 
 def wander(count: int, seed: int) -> Trajectory:
@@ -58,12 +58,6 @@ def test_errors_are_equal_to_evo_s(count, seed):
         require_equal_to_evo(ours, truth, to_evo(estimate), evo_metrics.RPE, delta, unit, 0.1, True)
 
 
-def straight(count: int) -> Trajectory:
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, 2, 3] = np.arange(count)
-    return Trajectory(np.arange(count, dtype=float), poses)
-
-
 @pytest.mark.parametrize("count", [2, 3, 50])
 @pytest.mark.parametrize("seed", range(5))
 def test_a_straight_path_is_turned_as_its_orientations_say(count: int, seed: int) -> None:
@@ -83,7 +77,7 @@ def test_a_straight_path_is_turned_as_its_orientations_say(count: int, seed: int
 def test_association(tolerance, expected):
     stamps = np.array([-0.5, 0.995, 2.004, 2.02, 3.5, 8.0, 9.3])
     estimate = Trajectory(stamps, np.tile(np.eye(4), (7, 1, 1)))
-    ours, true = associate(estimate, straight(10), tolerance)
+    ours, true = associate(estimate, straight(10, dt=1.0), tolerance)
     assert ours.stamps.tolist() == expected
     assert true.positions[:, 2] == pytest.approx(true.stamps)
     assert true.stamps.tolist() == expected

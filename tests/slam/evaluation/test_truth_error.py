@@ -8,7 +8,7 @@ import pytest
 from slam.evaluation.truth_error import doubtful, interpolated, truth_covariances
 from slam.geometry.se3 import adjoint, exp, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
-from tests.slam.numeric import chained
+from tests.slam.numeric import chained, straight
 
 NOISE = TruthNoise(rotation=5e-4, translation=0.02, wheels=True)
 LEVER = 1.5  # from the rear axle to the camera [m]
@@ -53,7 +53,7 @@ def test_interpolated_truth_is_noticed_where_it_is():
     assert not found[:10].any() and not found[19] and not found[29:].any()
     assert np.flatnonzero(interpolated(true, NOISE)).tolist() == [*range(20, 29)]
     standing = Trajectory(true.stamps, np.concatenate([np.tile(np.eye(4), (50, 1, 1)), drive(50).poses]))
-    for even in (standing, straight()):  # equal turns by nothing are none that was made up
+    for even in (standing, straight(400)):  # equal turns by nothing are none that was made up
         assert not interpolated(even, NOISE).any()
 
 
@@ -63,13 +63,6 @@ def test_a_path_that_was_interpolated_as_a_whole_is_no_truth():
     true = Trajectory(0.1 * np.arange(12), chained(exp(steps)))
     assert interpolated(true, NOISE).all()
     assert not interpolated(drive(12), NOISE).any()
-
-
-def straight(frames: int = 400) -> Trajectory:
-    """Forward by 1 m a frame, ten frames a second."""
-    poses = np.tile(np.eye(4), (frames, 1, 1))
-    poses[:, 2, 3] = np.arange(frames)
-    return Trajectory(0.1 * np.arange(frames), poses)
 
 
 def relative_errors(of: Trajectory, true: Trajectory, frames: int) -> tuple[np.ndarray, ...]:
@@ -83,7 +76,7 @@ def relative_errors(of: Trajectory, true: Trajectory, frames: int) -> tuple[np.n
 
 def with_slow_errors(correlation: float, seed: int) -> tuple[Trajectory, TruthNoise]:
     """A measured path whose errors have such a correlation from frame to frame."""
-    true, rng = straight(), np.random.default_rng(seed)
+    true, rng = straight(400), np.random.default_rng(seed)
     noise = TruthNoise(rotation=1e-3, translation=0.02)
     scale = np.repeat([noise.rotation, noise.translation], 3)
     error = [rng.normal(size=6)]
@@ -97,7 +90,7 @@ def with_slow_errors(correlation: float, seed: int) -> tuple[Trajectory, TruthNo
 @pytest.mark.parametrize("correlation", [0.0, 0.9, 0.99])
 @pytest.mark.parametrize("frames", [1, 10])
 def test_how_fast_errors_change_is_seen_in_the_path(correlation, frames):
-    true = straight()
+    true = straight(400)
     ratios = []
     for seed in range(6):
         measured, noise = with_slow_errors(correlation, seed)

@@ -9,7 +9,7 @@ from slam.compare.tables import groups, honesty
 from slam.compare.trial import Run
 from slam.run.results import errors_of_truth, figures, verdict, verdict_of_run
 
-TEN, ONE, START, HUNDRED = "ratio_10m", "ratio_1m", "ratio_start", "ratio_100m"
+TEN, ONE, START = "ratio_10m", "ratio_1m", "ratio_start"
 
 
 @pytest.mark.parametrize(

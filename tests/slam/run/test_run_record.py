@@ -13,22 +13,20 @@ from slam.geometry.se3 import exp
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.run.results import figures
 from slam.run.run_record import RunRecord, results_of
-from tests.slam.numeric import chained
+from tests.slam.numeric import chained, straight
 
 N, SIGMA = 60, 0.01
 NONE = np.zeros(0, np.int64)
 
 
-STRAIGHT = np.tile(np.eye(4), (N, 1, 1))
-STRAIGHT[:, 2, 3] = 0.2 * np.arange(N)
-TRUTH = Trajectory(0.1 * np.arange(N), STRAIGHT)
+TRUTH = straight(N, 0.2)
 SEQUENCE = SimpleNamespace(format="folder", ground_truth=TRUTH, truth_noise=TruthNoise(1e-4, 1e-3))
 
 
 def estimated():
     """The true path with independent errors, the first pose without any."""
     rng = np.random.default_rng(0)
-    poses = STRAIGHT @ np.array([exp(SIGMA * rng.standard_normal(6) * (k > 0)) for k in range(N)])
+    poses = TRUTH.poses @ np.array([exp(SIGMA * rng.standard_normal(6) * (k > 0)) for k in range(N)])
     return Trajectory(TRUTH.stamps, poses), np.array([SIGMA**2 * np.eye(6) * (k > 0) for k in range(N)])
 
 

@@ -103,18 +103,6 @@ def test_rows_of_times_belong_to_the_images_that_they_name_or_number(two_folders
     assert [left for left, _ in seeds(sequence)] == [0, 1, 3, 4, 5]
 
 
-@pytest.mark.parametrize("lost", [(), ("right",), ("left", "right")])
-def test_names_that_only_several_numbers_tell_apart_pair_the_same_ones(two_folders: Path, lost) -> None:
-    for side in ("left", "right"):
-        rename(two_folders / side, lambda i: f"s{1 + i // 3}_f{i % 3}.png")
-    for side in lost:
-        (two_folders / side / ("s1_f2.png" if side == "right" else "s2_f0.png")).unlink()
-    found = [(a, b) for a, b in seeds(open_sequence(two_folders)) if b is not None]
-    assert found == [
-        (i, i + 10) for i in range(6) if not (i == 2 and "right" in lost) and not (i == 3 and "left" in lost)
-    ]
-
-
 def test_one_camera_twice_is_refused(two_folders: Path, videos: Path) -> None:
     queries = [f"{two_folders}?left=left&right=left", f"{videos}?left=left.avi&right=left.avi"]
     (two_folders / "link").symlink_to(two_folders / "left")

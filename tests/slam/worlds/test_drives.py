@@ -12,7 +12,7 @@ from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
 from slam.sequences import open_sequence
 from slam.worlds import WorldSequence, open_world
-from slam.worlds.drives import read_path, sampled
+from slam.worlds.drives import sampled
 from slam.worlds.paths import camera_poses
 
 
@@ -21,16 +21,6 @@ def straight(count: int, step: float = 1.0) -> Trajectory:
     positions = np.column_stack([np.zeros(count), step * np.arange(count), np.full(count, 1.65)])
     zero = np.zeros(count)
     return Trajectory(np.arange(count) / 10, camera_poses(positions, zero, zero, zero))
-
-
-def test_paths_are_read_in_the_forms_of_kitti_and_tum(tmp_path):
-    path = straight(30)
-    path.write_kitti(tmp_path / "kitti.txt")
-    Trajectory(path.stamps + 1e9, path.poses).write_tum(tmp_path / "tum.txt")
-    for name in ("kitti", "tum"):
-        found = read_path(str(tmp_path / f"{name}.txt"))
-        assert np.allclose(found.poses, path.poses, atol=1e-8)
-        assert np.allclose(found.stamps, path.stamps, atol=1e-6)
 
 
 @pytest.mark.parametrize(
