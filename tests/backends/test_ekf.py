@@ -257,5 +257,5 @@ def test_a_camera_far_from_zero_loses_no_digits():
 
 def test_nothing_of_second_order_adds_up():
     """Corrections of centimetres, frame after frame, leave landmarks where they are: the path is the other filter's."""
-    one, other = (corridor(name, {}, 150, seed=0) for name in ("ekf", "iekf"))
+    one, other = (corridor(name, {}, 80, seed=0) for name in ("ekf", "iekf"))
     assert np.abs((one.errors - other.errors)[-1] / one.deviations[-1]).max() < 0.01

@@ -151,7 +151,7 @@ def test_a_camera_that_hovers_knows_where_those_that_have_left_are(name, frames)
 def test_a_camera_that_turns_away_and_back_knows_how_far_it_is_off(name):
     """In the world, and over its last steps, where those that have left come back; nothing is counted twice."""
     whole, steps, again = [], [], 0
-    for seed in range(6):
+    for seed in range(4):
         backend, poses, _, sights = swayed(name, 0, seed, kept=KEPT)
         known: set[int] = set()
         for k, T in enumerate(poses):
@@ -165,7 +165,7 @@ def test_a_camera_that_turns_away_and_back_knows_how_far_it_is_off(name):
                 P = relative_covariance(past.covariance, first, last)
                 xi = se3.log(se3.inverse(se3.inverse(first) @ last) @ se3.inverse(poses[k - 4]) @ T)
                 steps.append(xi @ np.linalg.solve(P, xi))
-    assert again > 600
+    assert again > 400
     assert np.mean(whole) < 6 * 1.4 and 0.85 < np.mean(steps) / 6 < 1.2
 
 

@@ -1,4 +1,4 @@
-"""A short run and its digest; ``python -m tests.slam.digest`` prints those of all back ends as JSON."""
+"""A short run and its digest; ``python -m tests.slam.digest`` prints those of back ends, or of parts, as JSON."""
 
 from __future__ import annotations
 
@@ -12,10 +12,14 @@ from typing import Any
 
 import numpy as np
 
+import backends
+import frontends
 import slam
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.system import StereoSlam
+from tests.backends.scenes import RIG, path, scene
+from tests.backends.scenes import run as step_through
 
 SEQUENCE = slam.open_sequence("synthetic:box?density=300&frames=100")
 FIRST = 58  # the box moves, and is found some thirty frames later
@@ -55,7 +59,22 @@ def run(backend: str, frames: int, images: int, threads: int) -> dict[str, str]:
     return {"observations": state(told), "images": state(shown), "bodies": digest_of(bodies), "count": str(len(bodies))}
 
 
+def parts() -> dict[str, str]:
+    """Digests of a front end's features, and of what a filter knows after some frames: few kernels are compiled."""
+    seen = frontends.create("surf", SEQUENCE.rig).extract(SEQUENCE.frame(FIRST))
+    backend = backends.create("ekf", RIG)
+    step_through(backend, scene(path(12, 0.1, np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.03, 0.0]))))
+    found = backend.estimate()
+    return {
+        "features": digest_of([seen.uv_left, seen.uv_right, seen.descriptors]),
+        "estimate": digest_of([found.T_world_left, found.covariance, found.positions, found.covariances]),
+    }
+
+
 def main() -> None:
+    if sys.argv[1] == "parts":
+        print(json.dumps(parts()))
+        return
     threads, elsewhere = int(sys.argv[1]), sys.argv[2] == "elsewhere"
     found: dict[str, dict[str, str]] = {}
 

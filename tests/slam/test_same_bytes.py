@@ -18,21 +18,26 @@ VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMB
 pytestmark = pytest.mark.slow
 
 
-def digests(compiled: Path, threads: int, where: str, seed: int) -> dict:
-    """What a new process says that keeps compiled kernels in a folder."""
-    variables = {**os.environ, **dict.fromkeys(VARIABLES, str(threads))}
-    variables |= {"PYTHONHASHSEED": str(seed), "NUMBA_CACHE_DIR": str(compiled)}
-    command = [sys.executable, "-m", "tests.slam.digest", str(threads), where]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=variables, timeout=900)
+def digests(*words: object, **variables: str) -> dict:
+    """What a new process says."""
+    command = [sys.executable, "-m", "tests.slam.digest", *map(str, words)]
+    environment = {**os.environ, **variables}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=900)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
 
-def test_threads_hash_seeds_and_whether_kernels_are_compiled_or_loaded_change_no_byte(tmp_path):
-    """The last as helpers are inlined: else one that compiled them calls other copies than one that loads them."""
-    found = digests(tmp_path, 1, "main", 0)
-    assert list(tmp_path.rglob("*.nbc"))
+def test_threads_and_hash_seeds_change_no_byte():
+    one, two = ({**dict.fromkeys(VARIABLES, str(n)), "PYTHONHASHSEED": str(12345 * n)} for n in (1, 2))
+    found = digests(1, "main", **one)
     assert set(found) == set(BACKENDS)
     assert all(int(each["count"]) > 0 for each in found.values())
     assert len({digest for each in found.values() for digest in each.values() if len(digest) == 64}) == 6
-    assert digests(tmp_path, 2, "elsewhere", 12345) == found
+    assert digests(2, "elsewhere", **two) == found
+
+
+def test_whether_kernels_are_compiled_or_loaded_changes_no_byte(tmp_path):
+    """As helpers are inlined: else a process that compiled them calls other copies than one that loads them."""
+    compiled = digests("parts", NUMBA_CACHE_DIR=str(tmp_path))
+    assert list(tmp_path.rglob("*.nbc"))
+    assert digests("parts", NUMBA_CACHE_DIR=str(tmp_path)) == compiled

@@ -153,16 +153,22 @@ def test_a_second_signal_stops_at_once(tmp_path, signals):
         pytest.fail("it is waited for")
 
 
+def test_a_signal_that_is_to_be_ignored_is(tmp_path, signals):
+    """As `nohup` has it."""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    catch_signals()
+    with ended_by_signals(tmp_path, RunRecord()) as until:
+        signal.raise_signal(signal.SIGHUP)
+        assert not until.is_set()
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-@pytest.mark.parametrize(("kill", "ignored"), [(signal.SIGINT, False), (signal.SIGKILL, False), (signal.SIGHUP, True)])
-def test_a_stopped_run_keeps_its_frames(tmp_path, kill, ignored):
-    """And where the signal is to be ignored, as `nohup` has it, the run goes on."""
-    frames = 12 if ignored else 2000
-    command = [sys.executable, "-m", "slam", "run", f"synthetic:desk?frames={frames}&width=128&height=96", "--quiet"]
+@pytest.mark.parametrize("kill", [signal.SIGINT, signal.SIGKILL])
+def test_a_stopped_run_keeps_its_frames(tmp_path, kill):
+    command = [sys.executable, "-m", "slam", "run", "synthetic:desk?frames=2000&width=128&height=96", "--quiet"]
     # A shell that starts the tests in the background has them ignore SIGINT, and what they start would too.
-    handler = signal.SIG_IGN if ignored else signal.default_int_handler if kill is signal.SIGINT else signal.SIG_DFL
-    heed = partial(signal.signal, signal.SIGINT if kill is signal.SIGKILL else kill, handler)
+    heed = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
     out = tmp_path / "out"
     process = subprocess.Popen([*command, "--out", str(out)], stderr=subprocess.PIPE, text=True, preexec_fn=heed)
     deadline = time.time() + 600  # where nothing is compiled yet and other processes run
@@ -171,12 +177,12 @@ def test_a_stopped_run_keeps_its_frames(tmp_path, kill, ignored):
         time.sleep(0.02)
     process.send_signal(kill)
     _, errors = process.communicate(timeout=300)
-    assert process.returncode == (0 if ignored else -9 if kill is signal.SIGKILL else 128 + kill), errors
+    assert process.returncode == (-9 if kill is signal.SIGKILL else 128 + kill), errors
     assert len(Trajectory.read_tum(path)) >= 5
     if (final := out / "trajectory_final.txt").exists():  # what a kill leaves in part is beside its place
         assert len(Trajectory.read_tum(final)) >= 5
     assert None not in rows_of(out / "frames.csv")[-1].values() and json.loads((out / "config.json").read_text())
-    if kill is not signal.SIGKILL and not ignored:
+    if kill is not signal.SIGKILL:
         assert f"stopped by {kill.name}; frames done so far are kept: `slam plot" in errors
         assert json.loads((out / "summary.json").read_text())["ended"] == "ended by the user"
         assert (out / "landmarks.csv").exists()
