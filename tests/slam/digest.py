@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 import backends
-import frontends
 import slam
+from frontends.surf import Surf
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.system import StereoSlam
@@ -60,13 +60,13 @@ def run(backend: str, frames: int, images: int, threads: int) -> dict[str, str]:
 
 
 def parts() -> dict[str, str]:
-    """Digests of a front end's features, and of what a filter knows after some frames: few kernels are compiled."""
-    seen = frontends.create("surf", SEQUENCE.rig).extract(SEQUENCE.frame(FIRST))
+    """Digests of the features of an image, and of what a filter knows after some frames: few kernels are compiled."""
+    keypoints, descriptors = Surf(300).detect_and_describe(SEQUENCE.frame(FIRST).left)
     backend = backends.create("ekf", RIG)
     step_through(backend, scene(path(12, 0.1, np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.03, 0.0]))))
     found = backend.estimate()
     return {
-        "features": digest_of([seen.uv_left, seen.uv_right, seen.descriptors]),
+        "features": digest_of([keypoints.uv, keypoints.response, descriptors]),
         "estimate": digest_of([found.T_world_left, found.covariance, found.positions, found.covariances]),
     }
 
