@@ -19,7 +19,7 @@ from slam.data import Observations
 from slam.errors import MeasurementError
 from slam.guarded import guarded
 from slam.interfaces import Backend, MapBackend, RestingBackend, RevisingBackend
-from slam.testing import GOOD, RIG, RIGHT, RUNS, check_backend, findings, protocol
+from slam.testing import GOOD, RIG, RIGHT, RUNS, check_backend, findings
 from slam.testing.__main__ import main
 from tests.backends.hostile_calls import play
 from tests.scripts import load_script
@@ -141,16 +141,6 @@ class Boastful(EkfBackend):
     def estimate(self, landmarks=True):
         found = super().estimate(landmarks)
         return replace(found, covariance=1e-6 * found.covariance, covariances=1e-6 * found.covariances)
-
-
-class Certain(EkfBackend):
-    def estimate(self, landmarks=True):
-        return replace(super().estimate(landmarks), covariance=np.zeros((6, 6)))
-
-
-def test_a_covariance_of_zeros_is_called_singular():
-    with pytest.raises(AssertionError, match="pose: covariance is singular"):
-        protocol.estimate_is_in_order(Certain)
 
 
 TIER_OF = {Forgetful: "runs", Careless: "right", Boastful: "right"}

@@ -7,7 +7,6 @@ import pytest
 
 import slam
 from slam.calibration import RigModel, RigPosterior
-from slam.commands.calibrate import _print
 from slam.errors import SlamError
 from slam.run.calibrating import _judged
 from tests.scripts import command
@@ -56,14 +55,6 @@ def test_a_correction_is_advised_only_where_it_is_expected_to_help(off, sigma, a
     words, worth = _judged(model, posterior, 0.4, 100.0, differing)
     assert worth == (word in ("This is worth correcting", "This is bad"))  # only then it is said how to use it
     assert f"{off:.2f} ± {sigma:.2f} px in disparity" in words and word in words
-
-
-@pytest.mark.parametrize(("unsolved", "said"), [(1, "5 pairs of views; in 1 other too"), (2, "in 2 others too")])
-def test_pairs_that_agree_on_no_motion_are_counted(made, unsolved, said, capsys):
-    tree = json.loads((made[0] / "rig.json").read_text())
-    one = tree["recordings"][0] | {"pairs": 5, "unsolved_pairs": unsolved}
-    _print(tree | {"recordings": [one], "apart": None})
-    assert said in " ".join(capsys.readouterr().out.split())
 
 
 def test_it_is_the_prior_of_a_run(made, tmp_path):

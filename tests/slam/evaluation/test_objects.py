@@ -3,13 +3,10 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
-from slam.evaluation.association_truth import SurfacePoints
 from slam.evaluation.objects import ObjectScore, motion_errors, object_nees
 from slam.geometry.se3 import exp, inverse
 from slam.object_data import MovingObject, ObjectEstimate
-from slam.sequences import open_sequence
 
 RNG = np.random.default_rng(0)
 TRUE = np.array([exp(np.array([0.02 * k, 0.01 * k, 0, 0.05 * k, 0, 1 + 0.01 * k])) for k in range(20)])
@@ -66,30 +63,3 @@ def test_nees_counts_from_where_a_body_was_found_though_it_is_reported_later():
         )  # fmt: skip
         score.add(k, result, np.ones(4, np.int64))
     np.testing.assert_allclose(score.body(1)["mean NEES"], 6.0, rtol=1e-6)
-
-
-@pytest.fixture(scope="module")
-def boxes():
-    return open_sequence("synthetic:boxes?frames=40&camera=moving")
-
-
-def test_pixels_of_the_still_world_are_found_again(boxes):
-    """Projecting a surface point through the true poses gives the pixel in another frame: its depth agrees there."""
-    points = SurfacePoints(boxes)
-    v, u = np.mgrid[20:220:20, 20:300:20]
-    uv = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
-    rows = np.arange(len(uv))
-
-    def errors(frame, matched, pixels, added=rows[:0]):
-        features = SimpleNamespace(uv_left=pixels)
-        return points.of_matches(frame, SimpleNamespace(
-            features=features, matched=matched, matched_features=matched, added=added, added_features=added
-        ))  # fmt: skip
-
-    first = rows[: len(rows) // 2]  # the others are seen first as matches, and have no error then
-    assert len(errors(0, rows[len(first) :], uv, added=first)) == 0
-    still = boxes.object_ids(0)[v.ravel(), u.ravel()] == 0
-    found = errors(0, rows, uv)
-    assert np.isinf(found[~still]).all() and found[still].max() < 1e-6 and not still.all()
-    assert (errors(0, rows, uv + np.array([0, 4.0]))[still] > 3.9).all()
-    assert np.median(errors(30, rows[still], uv)) > 1.0  # the camera moves, so the same pixels show other points
