@@ -175,7 +175,10 @@ def test_at_rest_neither_the_pose_nor_its_covariance_changes_and_the_velocity_is
     ("name", "options", "seed"),
     [
         *(("window", {}, seed) for seed in range(3)),
-        *(("smoother", {"lag": lag}, s) for lag, s in ((None, 0), (None, 1), (14, 2))),
+        *(
+            pytest.param("smoother", {"lag": lag}, s, marks=pytest.mark.slow)
+            for lag, s in ((None, 0), (None, 1), (14, 2))
+        ),
     ],
 )
 def test_a_map_that_begins_where_nobody_knows_how_the_camera_is_turned(name, options, seed):

@@ -147,6 +147,7 @@ def test_a_camera_that_hovers_knows_where_those_that_have_left_are(name, frames)
     assert len(ids) > 30 and ratio.min() > 0.9 and np.median(ratio) < 1.5
 
 
+@pytest.mark.slow
 @BOTH
 def test_a_camera_that_turns_away_and_back_knows_how_far_it_is_off(name):
     """In the world, and over its last steps, where those that have left come back; nothing is counted twice."""

@@ -64,6 +64,7 @@ def test_the_path_and_its_covariance_with_all_options(options):
     assert (len(backend.state.sights) < 9) == ("past" in options), "what is kept does not grow for ever"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seen_at_once", "seed", "most"),
     [(100, 0, 0.3), (15, 0, 1.5), (8, 2, 2.5)],
@@ -132,6 +133,7 @@ def test_frames_that_measured_nothing_are_no_failure(lag, dark):
     assert lag < 4 or sigma(backend) < 0.04
 
 
+@pytest.mark.slow
 def test_poses_that_are_solved_for_alone_count_nothing_twice():
     """As if each measured other landmarks: errors were 3.4 times those with every pose in the graph."""
     models = EstimatorModels(MotionModel(1.0, 0.3), 0.7, initial_velocity_sigma=15.0)
@@ -306,6 +308,7 @@ def test_the_map_is_where_it_was_after_a_hundred_frames_in_the_dark():
     assert backend.trajectory().stamps.tolist() == data.stamps.tolist()
 
 
+@pytest.mark.slow
 def test_landmarks_that_return_after_a_lap_are_measured_again_without_a_lag():
     """What the camera had drifted since did not count: 16 good measurements were refused."""
     models, refused = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=1.0), 0

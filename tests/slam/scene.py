@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
@@ -16,6 +17,9 @@ RIG = StereoRig.rectified_pair(300, 159.5, 119.5, 0.12, 320, 240)
 
 #: For its points.
 CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5), map=MapConfig(target_in_view=40, max_depth_error=0.3))
+
+#: For what is above the back ends: the fast tests try one of them.
+BACKENDS = ["ekf", *(pytest.param(name, marks=pytest.mark.slow) for name in ("smoother", "window"))]
 
 #: Distorted, with the right camera turned and shifted.
 GENERAL_RIG = StereoRig(

@@ -17,9 +17,8 @@ import slam
 from slam.data import FrameStatus
 from slam.runtime.threads import one_blas_thread
 from slam.system import StereoSlam
-from tests.slam.scene import CONFIG, RIG, Cloud, path
+from tests.slam.scene import BACKENDS, CONFIG, RIG, Cloud, path
 
-BACKENDS = ("ekf", "smoother", "window")
 HERE = tuple(str(Path(slam.__file__).parents[1] / package) for package in ("slam", "backends"))
 
 

@@ -14,7 +14,6 @@ from slam.input.warnings import REPEATED
 
 SEQUENCE = slam.open_sequence("synthetic:desk?frames=20")
 FROZEN = [*range(12), *[11] * 7, *range(12, 20)]
-BACKENDS = ("ekf", "smoother")
 
 
 @cache
@@ -27,17 +26,16 @@ def shown(order: list[int], given: list[StereoFrame] | None = None) -> list[Ster
     return [replace((given or frames())[k], index=j, stamp=j / 30) for j, k in enumerate(order)]
 
 
-def system(backend: str = "ekf") -> slam.StereoSlam:
-    return slam.StereoSlam(SEQUENCE.rig, "surf", backend)
+def system() -> slam.StereoSlam:
+    return slam.StereoSlam(SEQUENCE.rig, "surf", "ekf")
 
 
 def repeats(results) -> list[int]:
     return [result.index for result in results if REPEATED in result.reason]
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_frozen_images_are_predicted_and_said(backend, caplog):
-    s = system(backend)
+def test_frozen_images_are_predicted_and_said(caplog):
+    s = system()
     results = [s.process(frame) for frame in shown(FROZEN)]
     assert repeats(results) == list(range(12, 19))
     before, frozen, after = results[11], results[12:19], results[19:]
@@ -46,7 +44,7 @@ def test_frozen_images_are_predicted_and_said(backend, caplog):
     grown = [np.trace(r.estimate.covariance) for r in (before, *frozen)]
     assert grown == sorted(grown)
     assert {r.status for r in after} == {FrameStatus.TRACKED}
-    plain = system(backend)
+    plain = system()
     alone = [plain.process(frame) for frame in shown(list(range(20)))][-1]
     apart = np.linalg.norm((after[-1].estimate.T_world_left - alone.estimate.T_world_left)[:3, 3])
     assert apart < 0.02

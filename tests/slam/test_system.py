@@ -9,12 +9,10 @@ import slam
 from slam.data import FrameStatus, StereoFeatures, StereoFrame
 from slam.errors import MeasurementError, SequenceError
 from slam.system import StereoSlam
-from tests.slam.scene import CONFIG, RIG, Cloud, path
-
-BACKENDS = ("ekf", "iekf", "smoother", "window")
+from tests.slam.scene import BACKENDS, CONFIG, RIG, Cloud, path
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", ["ekf", "iekf", "smoother", "window"])
 def test_tracks_a_cloud(backend):
     cloud, truth, system = Cloud(150), np.array(path(40)), StereoSlam(RIG, None, backend, config=CONFIG)
     results = [system.process_features(cloud.features(T, k / 30, 0.3)[0]) for k, T in enumerate(truth)]

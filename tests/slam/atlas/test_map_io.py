@@ -19,9 +19,8 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
-from tests.slam.scene import RIG, Cloud, path
+from tests.slam.scene import BACKENDS, RIG, Cloud, path
 
-BACKENDS = ("ekf", "smoother", "window")
 CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5))
 
 

@@ -16,9 +16,8 @@ from slam.geometry.se3 import inverse, log
 from slam.models import KINDS
 from slam.system import StereoSlam
 from tests.slam.atlas.test_atlas import sequence, system_for  # noqa: F401 (a fixture)
-from tests.slam.scene import RIG, Cloud, path
+from tests.slam.scene import BACKENDS, RIG, Cloud, path
 
-BACKENDS = ("ekf", "smoother", "window")
 SEEN, DARK, SKIPPED = 35, 30, 12  # frames before the dark, in it, and how much farther than they the camera was carried
 
 

@@ -43,6 +43,7 @@ def test_the_box_is_found_once_and_followed_and_little_else_is_said_to_move(box_
         assert not np.isin(result.added_features, result.moving_features).any()
 
 
+@pytest.mark.slow
 def test_a_box_that_is_hidden_for_two_seconds_keeps_its_id():
     """It moves when it is hidden, and rests when it comes back, where nothing predicted it."""
     sequence = slam.open_sequence("synthetic:box?density=300&camera=moving&sigma=0.3")

@@ -15,7 +15,7 @@ from slam.config import SystemConfig
 from slam.geometry.se3 import exp, inverse, log
 from slam.models import EstimatorModels
 from slam.tracks.table import Tracks
-from tests.slam.scene import RIG, features_at
+from tests.slam.scene import BACKENDS, RIG, features_at
 
 SIGMA = 0.3  # pixel noise [px]; the detector is told one pixel
 FRAMES = WINDOW
@@ -117,7 +117,7 @@ def start():
     return sequence, {k: frontend.extract(sequence.frame(k)) for k in range(40, 76)}
 
 
-@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_box_that_starts_to_move_does_not_carry_the_camera_along(start, backend):
     """Without this test of landmarks the position is off by up to 20 standard deviations in frames 65 to 70."""
     sequence, features = start

@@ -12,7 +12,7 @@ from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.system import StereoSlam
 from tests.slam.calibration.drives import CAR, Street, disparity_error, drive, parameters, pose, residual_fields
-from tests.slam.scene import GENERAL_RIG, RIG, Cloud, features_at
+from tests.slam.scene import BACKENDS, GENERAL_RIG, RIG, Cloud, features_at
 
 #: A turn of the right camera after a knock [rad].
 TURNED = parameters(pitch=5e-4, yaw=5e-4, roll=5e-4)
@@ -179,7 +179,7 @@ def test_a_change_that_does_not_count_is_not_applied():
     assert calibration.apply() is None
 
 
-@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_revision_does_not_move_the_camera(backend):
     """Landmarks follow the new correction: else a sudden change of all pixels looks like motion.
 

@@ -55,6 +55,7 @@ def test_bad_input_is_refused(tmp_path, words, said):
         command(*(str(word).replace("{empty}", str(tmp_path)) for word in words), "--out", tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_the_demo_speaks_of_a_box_only_where_one_was_found(tmp_path, monkeypatch, capsys):
     """In three frames nothing is known to move."""
     monkeypatch.setattr("slam.commands.demo.ONLINE", ("ekf",))

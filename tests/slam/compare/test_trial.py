@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 from typer.testing import CliRunner
 
 from slam.commands.cli import app
@@ -39,6 +40,7 @@ def test_a_trial_has_the_settings_of_its_sequence_s_kind(tmp_path):
     assert settings.objects == expected.objects and settings.map == replace(expected.map, max_landmarks=120)
 
 
+@pytest.mark.slow
 def test_a_run_that_began_again_has_figures_and_its_cause_and_no_recording(tmp_path):
     """By a baseline 33 times too long nothing is tracked, and back end follows back end."""
     drive = write_euroc(open_sequence("synthetic:desk?frames=9&baseline=0.075"), tmp_path / "drive")

@@ -13,9 +13,8 @@ import pytest
 from slam.data import FrameStatus, StereoFeatures
 from slam.errors import MeasurementError
 from slam.system import StereoSlam
-from tests.slam.scene import CONFIG, RIG, Cloud, path
+from tests.slam.scene import BACKENDS, CONFIG, RIG, Cloud, path
 
-BACKENDS = ("ekf", "smoother", "window")
 COLUMNS = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
 
 

@@ -18,7 +18,7 @@ def walk():
     turns = np.stack([0.2 * np.sin(0.9 * t), 0.5 * np.sin(0.6 * t), 0.1 * np.cos(1.1 * t)], axis=1)
     places = np.stack([np.sin(0.7 * t), 0.2 * np.sin(1.3 * t), 0.3 * t + 0.2 * np.sin(2 * t)], axis=1)
     truth = Trajectory(t, pose(so3_exp(turns), places))
-    rng, rows = np.random.default_rng(0), np.arange(0, len(t), 20)
+    rng, rows = np.random.default_rng(0), np.arange(0, len(t), 40)
     drift = exp(np.cumsum(0.0003 * rng.standard_normal((len(rows), 6)), axis=0))
     return Trajectory(t[rows], exp(np.full(6, 0.3)) @ truth.poses[rows] @ drift), truth
 

@@ -16,7 +16,7 @@ from slam.tracks.config import AssociationConfig, MapConfig
 from slam.tracks.localizer import Localizer, Search, jump
 from slam.tracks.step import TrackingState
 from slam.tracks.table import LandmarkTable
-from tests.slam.scene import RIG, Cloud, path
+from tests.slam.scene import BACKENDS, RIG, Cloud, path
 
 T_TRUE = se3.exp(np.array([0.02, 0.3, -0.01, 0.2, 0.05, 0.4]))
 
@@ -89,7 +89,6 @@ def test_few_landmarks_of_long_ago_count_when_several_frames_show_them(shown, fr
     assert not landmarks.returning.any()
 
 
-BACKENDS = ("ekf", "smoother", "window")
 MAP = MapConfig(target_in_view=40, max_depth_error=0.3, restart_after=12)
 CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5), map=MAP)
 

@@ -14,9 +14,8 @@ from slam.geometry import se3
 from slam.system import StereoSlam
 from slam.tracks.monocular import depths_by_motion, frame_covariance, two_view_depth
 from slam.tracks.table import Tracks
-from tests.slam.scene import RIG, Cloud, features_at
+from tests.slam.scene import BACKENDS, RIG, Cloud, features_at
 
-BACKENDS = ("ekf", "smoother", "window")
 STEP = se3.exp(np.array([0.02, 0.05, -0.03, 0.3, 0.05, 0.1]))  # the camera now, in its coordinates then
 NOISE = np.diag(np.repeat([1e-3, 5e-3], 3) ** 2)
 SIGMA = 0.5
@@ -33,14 +32,14 @@ def views(rig, count, rng, noise=0.0, motion=(0, 0, 0, 0, 0, 0)):
 def test_the_covariance_fits_the_errors():
     """Pixel noise and an uncertain motion, drawn again each time: squared distances as χ² with three degrees."""
     rng, distances, misfits = np.random.default_rng(1), [], []
-    for _ in range(300):
+    for _ in range(150):
         motion = np.linalg.cholesky(NOISE) @ rng.standard_normal(6)
         local, then, now = views(RIG, 5, rng, SIGMA, motion)
         found = two_view_depth(RIG, then, now, STEP, NOISE, SIGMA)
         error = found.local - local
         distances.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariances), error).mean())
         misfits.append(found.misfit.mean())
-    # the mean of 300 times 5 (correlated) values is sure to 10 %; depth is a little skew
+    # the mean of 150 times 5 (correlated) values is sure to 10 %; depth is a little skew
     assert 2.5 < np.mean(distances) < 3.6
     assert 0.8 < np.mean(misfits) < 1.25
 

@@ -15,7 +15,7 @@ from slam.data import StereoFeatures
 from slam.geometry.se3 import exp, inverse, log, transform
 from slam.tracks.standing import Standing
 from slam.tracks.step import HIDDEN
-from tests.slam.scene import RIG, features_at
+from tests.slam.scene import BACKENDS, RIG, features_at
 
 SIGMA = 0.3
 
@@ -107,7 +107,7 @@ def test_a_truck_that_passes_does_not_take_the_camera_along(backend):
     assert farthest < 1e-2
 
 
-@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_standing_camera_does_not_believe_each_frame_for_itself(backend):
     """Light moves its features slowly and alike."""
     scene, found = Scene(0.0), []
@@ -123,7 +123,7 @@ def test_a_standing_camera_does_not_believe_each_frame_for_itself(backend):
     assert np.all(np.diag(found[-1].covariance) >= 0.9 * np.diag(found[8].covariance))
 
 
-@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_camera_that_stands_is_found_again(backend):
     """Lost before it stood: a pose that was predicted does not hold."""
     scene, results = Scene(0.0), []
@@ -169,7 +169,7 @@ def street(slam_data):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_people_who_walk_by_hardly_move_the_camera(street, backend):
     """Two people are in view at most; their shadows, through which the ground is seen, are no bodies."""
     sequence, seen = street
