@@ -82,13 +82,14 @@ def row(sequence: Sequence, backend: str, frontend: Remembered, config: SystemCo
 
 
 def main() -> int:
-    parser = script_options(__file__, __doc__, "30 frames")
+    parser = script_options(__file__, __doc__, "15 frames, one back end")
     arguments = parser.parse_args()
-    sequence = open_sequence("synthetic:aisle?frames=30" if arguments.quick else "synthetic:aisle")
+    sequence = open_sequence("synthetic:aisle?frames=15" if arguments.quick else "synthetic:aisle")
+    names = ONLINE[: 1 if arguments.quick else None]
     config = SystemConfig.for_kind(sequence.kind)
     frontend = Remembered(sequence.rig, **config.frontend)
-    rows = [row(sequence, backend, frontend, config, arguments.out) for backend in ONLINE]
-    runs = [RunData.read(arguments.out / backend, backend) for backend in ONLINE]
+    rows = [row(sequence, backend, frontend, config, arguments.out) for backend in names]
+    runs = [RunData.read(arguments.out / backend, backend) for backend in names]
     plot(runs, arguments.out / "top_view.png", "map")
     plot(runs, arguments.out / "errors.png", "errors")
     show(arguments.out / "table.json", HEADER, rows, 2)

@@ -196,7 +196,7 @@ def main() -> int:
         return 0
     faults, trials, frames = FAULTS, arguments.trials, arguments.frames
     if arguments.quick:
-        faults, trials, frames = (FAULTS[0], FAULTS[4]), 1, 15
+        faults, trials, frames = (FAULTS[0], FAULTS[4]), 1, 10
         found = dict(list(found.items())[:1])
     ways: dict[str, Callable[[Path], Drive | Sequence]] = {
         "as they are": open_sequence,

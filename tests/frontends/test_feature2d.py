@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-import frontends.surf
 from frontends.surf import Keypoints, Surf
-from slam.errors import ConfigurationError, SequenceError
+from slam.errors import SequenceError
 from tests.frontends.test_surf import IMAGE
 
 
@@ -40,21 +39,3 @@ def test_key_points_that_are_impossible():
     with pytest.raises(SequenceError, match="no finite place"):
         Surf().compute(IMAGE, [cv2.KeyPoint(float("nan"), 0, 9)])
     assert repr(Keypoints.from_cv2([inside])) == "Keypoints(1 features)"
-
-
-def test_setters_change_what_is_found_and_refuse_what_this_surf_does_not_have():
-    surf = frontends.surf.create()
-    for name, value, wrong in (
-        ("HessianThreshold", 5000, -1),
-        ("NOctaves", 2, 5),
-        ("NOctaveLayers", 2, 4),
-        ("Upright", True, "no"),
-        ("Extended", False, True),
-    ):
-        getattr(surf, f"set{name}")(value)
-        with pytest.raises(ConfigurationError):
-            getattr(surf, f"set{name}")(wrong)
-        assert getattr(surf, f"get{name}")() == value
-    keypoints, descriptors = surf.detectAndCompute(IMAGE, None)
-    other, expected = Surf(5000, 2, 2).detectAndCompute(IMAGE)
-    assert len(keypoints) == len(other) > 0 and np.array_equal(descriptors, expected)

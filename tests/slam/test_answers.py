@@ -10,7 +10,7 @@ import pytest
 from backends.ekf import EkfBackend
 from frontends.surf import SurfFrontend
 from slam.data import Observations, StereoFrame
-from slam.errors import ConfigurationError, MeasurementError, PartError, SlamError
+from slam.errors import MeasurementError, PartError, SlamError
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.frontends.scenes import RIG, stereo_pair
@@ -111,10 +111,3 @@ def test_a_front_end_that_stops_does_not_end_the_frames():
     for overlap in (True, False):
         with pytest.raises(PartError, match=r"^frame 0: Blind failed: StopIteration"):
             list(system.run(frames, overlap))
-
-
-def test_what_is_no_part_is_refused():
-    with pytest.raises(ConfigurationError, match="back end int is none: it lacks predict"):
-        StereoSlam(RIG, None, 3)
-    with pytest.raises(ConfigurationError, match="rig must be a StereoRig, got NoneType"):
-        StereoSlam(None)

@@ -44,11 +44,6 @@ def test_python_m_slam_is_not_hidden_and_finds_a_package_in_the_folder(folder):
     )
 
 
-def test_the_front_end_of_comparisons_alone_is_refused_elsewhere_with_the_known_ones():
-    with pytest.raises(UnknownNameError, match=r"alone; known: .*surf"):
-        registry.resolve("frontends", "simulated")
-
-
 def test_a_back_end_by_its_module_in_the_working_folder(tmp_path, monkeypatch):
     (tmp_path / "my_own_module.py").write_text(
         "class Mine:\n    def __init__(self, rig, models=None):\n        self.rig = rig\n    extract = print\n"

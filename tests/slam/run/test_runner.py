@@ -15,7 +15,6 @@ import pytest
 
 from slam.atlas.config import AtlasConfig
 from slam.atlas.map_io import load_map
-from slam.calibration.estimator import SelfCalibration
 from slam.commands.ending import Stopped, catch_signals, ended_by_signals
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
@@ -53,13 +52,6 @@ def test_landmarks_that_have_left_the_map_are_kept_where_they_were(tmp_path, mon
     assert len(data.old) > 10
     away = np.linalg.norm(data.old - data.online.positions.mean(axis=0), axis=1)
     assert 0.5 < np.median(away) < 6.0  # on the shelves
-
-
-def test_what_the_calibration_is_warned_of_is_said_and_kept(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(SelfCalibration, "warning", "the images fit another focal length")
-    summary = run(open_sequence("synthetic:aisle?frames=2"), options(tmp_path))
-    assert caplog.messages == summary["warnings"] == ["the images fit another focal length"]
-    assert summary["doubt"] == "" == summary["tracking"]
 
 
 def test_why_no_path_can_be_trusted_is_the_cause_of_lost_frames(tmp_path, monkeypatch):

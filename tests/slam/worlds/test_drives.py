@@ -12,15 +12,7 @@ from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
 from slam.sequences import open_sequence
 from slam.worlds import WorldSequence, open_world
-from slam.worlds.drives import sampled
 from slam.worlds.paths import camera_poses
-
-
-def straight(count: int, step: float = 1.0) -> Trajectory:
-    """A drive along +y in level axes, 10 poses a second."""
-    positions = np.column_stack([np.zeros(count), step * np.arange(count), np.full(count, 1.65)])
-    zero = np.zeros(count)
-    return Trajectory(np.arange(count) / 10, camera_poses(positions, zero, zero, zero))
 
 
 @pytest.mark.parametrize(
@@ -38,16 +30,6 @@ def test_what_is_no_path_is_refused_in_one_line(tmp_path, text, message):
     with pytest.raises(SequenceError, match=message) as caught:
         open_sequence(f"synthetic:drive?path={file}")
     assert str(file) in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_poses_stay_as_they_are_at_the_usual_rate_and_lie_between_them_at_another():
-    path = straight(30)
-    usual = {"rate": 10.0, "speed": 1.0, "frames": 0}
-    assert np.array_equal(sampled(path, usual).poses, path.poses)
-    assert [len(sampled(path, {**usual, "frames": n})) for n in (7, 700)] == [7, 30]
-    assert np.allclose(sampled(path, {**usual, "rate": 20.0}).positions[:, 1], np.arange(59) / 2)
-    fast = sampled(path, {**usual, "speed": 2.0})
-    assert np.allclose(fast.stamps, np.arange(15) / 10) and np.allclose(fast.positions[:, 1], 2 * np.arange(15))
 
 
 LAP = 450  # frames of a round in `loop`
