@@ -24,7 +24,9 @@ def go_on(system: StereoSlam, first: int, last: int) -> str:
 
 
 @pytest.mark.parametrize("backend", ["ekf", "window"])
-@pytest.mark.parametrize(("after", "setting"), [(0, ""), (1, ""), (20, ""), (20, "map.monocular=true")])
+@pytest.mark.parametrize(
+    ("after", "setting"), [(0, ""), (1, ""), (20, ""), pytest.param(20, "map.monocular=true", marks=pytest.mark.slow)]
+)
 def test_copies_without_gtsam_go_on_to_the_same_bytes(backend, after, setting):
     config = SystemConfig().with_settings([setting] if setting else [])
     system = StereoSlam(SEQUENCE.rig, None, backend, config=config)

@@ -116,6 +116,7 @@ def test_a_loop_puts_the_map_in_its_place(run):
     assert off[SEEN - 1] < 0.3 and off[run.begins + 1] < 0.5  # all of the change is in the dark
 
 
+@pytest.mark.slow
 def test_what_was_seen_before_is_found_again_where_the_camera_returns_at_once(sequence):  # noqa: F811
     """A second map begins; then the camera is carried back to the first one, whose frame it is in again."""
     system = system_for(sequence, "ekf")

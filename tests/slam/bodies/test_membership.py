@@ -14,7 +14,6 @@ from slam.bodies.bodies import PROOF, Body, continued, new_body, with_evidence, 
 from slam.bodies.config import CLEAR, ObjectsConfig
 from slam.bodies.fits import fit_positions
 from slam.bodies.membership import merge
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, transform
 from slam.tracks.table import Tracks
 from tests.slam.scene import features_at
@@ -22,7 +21,6 @@ from tests.slam.scene import features_at
 WINDOW = 12
 SLOT = WINDOW - 1
 SIGMA = 0.002  # [m]
-RIG = StereoRig.rectified_pair(260.0, 160, 120, 0.12, 320, 240)
 FRAME: Any = SimpleNamespace(setup=SimpleNamespace(config=ObjectsConfig()), slot=SLOT, eye=np.zeros(3))
 TIMES = (np.arange(WINDOW) - SLOT) / 30.0
 

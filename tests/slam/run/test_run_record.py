@@ -64,6 +64,7 @@ def test_frames_that_are_not_tracked_are_counted_and_left_out_of_the_accuracy():
     assert found["tracked"] == pytest.approx(47 / 60)
 
 
+@pytest.mark.slow
 def test_a_path_that_lacks_frames_is_said(caplog):
     """Of a back end of one's own; the frames were left out of the final error without a word."""
     path, covariances = estimated()

@@ -37,6 +37,7 @@ def as_read():
     return pose(rotation_from_quaternion(quaternion(TRUTH.poses[:, :3, :3])[:, [3, 0, 1, 2]]), TRUTH.positions)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("poses", "late", "words"),
     [
