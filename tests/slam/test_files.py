@@ -117,17 +117,18 @@ AT = ONE.index(b"PK\x01\x02") + 8  # its flags
 
 
 @pytest.mark.parametrize(
-    ("data", "words"),
+    ("make", "words"),
     [
-        (packed({name: bytes(40_000_000) for name in "abc"}), "would unpack to 12"),
-        (ONE[:AT] + b"\x01" + ONE[AT + 1 :], "encrypted"),
-        (packed({"a": b"x"}, zipfile.ZIP_LZMA), "packed in a way"),
-        (packed({f"{k}": b"" for k in range(200)}), "200 members"),
+        (lambda: packed({name: bytes(40_000_000) for name in "abc"}), "would unpack to 12"),
+        (lambda: ONE[:AT] + b"\x01" + ONE[AT + 1 :], "encrypted"),
+        (lambda: packed({"a": b"x"}, zipfile.ZIP_LZMA), "packed in a way"),
+        (lambda: packed({f"{k}": b"" for k in range(200)}), "200 members"),
     ],
     ids=["bomb", "encrypted", "packed oddly", "many members"],
 )
-def test_an_archive_made_on_purpose_is_refused(data, words):
+def test_an_archive_made_on_purpose_is_refused(make, words):
     assert unpack(ONE, "a.npz") == {"a": b"x"}
+    data = make()
     started = time.process_time()
     with pytest.raises(SlamError, match=f"a.npz: .*{words}"):
         unpack(data, "a.npz")
