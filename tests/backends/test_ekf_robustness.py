@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,17 +11,28 @@ from scipy.stats import chi2
 import backends
 from backends.ekf import EkfBackend
 from backends.ekf.innovation import Correction, Linearisation
+from backends.ekf.solve import correction
 from backends.iekf import IekfBackend
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel, SlideModel, models_for
-from tests.backends.ekf_runs import DRIVE, FORWARD, MODELS, STILL, YAW, dense, errors, predicted
+from tests.backends.ekf_runs import DRIVE, FORWARD, MODELS, ROLL, STILL, YAW, dense, errors, predicted
 from tests.backends.hostile_calls import play
-from tests.backends.scenes import RIG, cloud, nees, observe, path, scene, step
+from tests.backends.scenes import RIG, cloud, nees, observe, path, run, scene, step
 
 # --- gaps and turns ---
 
 BOTH = pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])
+
+
+@pytest.mark.parametrize("rate", [YAW, ROLL, np.array([0.6, 0.6, 0.6])], ids=["heading", "roll", "all"])
+def test_the_angles_singularity_is_harmless(rate):
+    data = scene(path(70, 0.1, 0.2 * FORWARD, rate), points=1000)  # turns by 400 degrees
+    backend = EkfBackend(RIG, MODELS)
+    reports = run(backend, data)
+    assert errors(backend, data.poses).max() < 0.03
+    assert nees(backend, data.poses[-1]) < chi2.ppf(0.9999, 6)
+    assert sum(len(r.rejected) for r in reports) < 10
 
 
 @BOTH
@@ -187,3 +199,12 @@ def test_a_roll_in_one_step(make, degrees):
         assert report.status is UpdateStatus.OK and len(report.rejected) <= 1
         found.append(nees(backend, rolled))
     assert max(found) < chi2.ppf(0.9999, 6)
+
+
+def test_of_two_agreements_of_minorities_the_larger_counts(monkeypatch):
+    agreeing = iter([4, 1])
+    found = lambda _: SimpleNamespace(used=np.arange(12) < next(agreeing))  # noqa: E731
+    monkeypatch.setattr("backends.ekf.solve._plausible", found)
+    camera, covariance = SimpleNamespace(pose=np.eye(4), at=lambda T: T), SimpleNamespace(P=np.eye(3))
+    update = SimpleNamespace(camera=camera, covariance=covariance, z=np.zeros((12, 3)), linearised=lambda camera: None)
+    assert correction(update, np.eye(4), lambda: None).used.sum() == 4

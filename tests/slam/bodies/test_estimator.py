@@ -217,3 +217,30 @@ def test_what_a_body_can_do():
     assert models.known(estimate(known, known))
     assert not models.known(estimate(np.diag([1, 1, 1, 4, 4, 4.0]), known))
     assert not models.known(estimate(known, np.full((6, 6), np.nan)))
+
+
+def test_points_join_and_leave():
+    """One half of the points is seen first, then both, then the other half alone: it is the same body."""
+    scene = box_scene(seed=7, frames=24, points=30)
+
+    def part(k, o):
+        low = o.points < 1015
+        keep = low if k < 8 else ~low if k >= 16 else np.ones(len(o.points), bool)
+        return replace(o, points=o.points[keep], uv_left=o.uv_left[keep], uv_right=o.uv_right[keep])
+
+    found = outcome(scene, rule=part)
+    assert len(found.estimates[12].used) > 25 and (found.estimates[-1].used >= 1015).all()
+    assert found.pose.translation.max() < 0.03 and found.pose_nees[-6:].mean() < 14
+
+
+def test_number_of_points_is_limited():
+    scene = box_scene(seed=9, frames=8, points=60)
+    models = replace(scene.models, objects=replace(scene.models.objects, points=20))
+    beliefs = [b for _, b, _ in follow("window", replace(scene, models=models))]
+    assert max(int(b.alive.sum()) for b in beliefs) == 20 and all(len(b.estimate.used) > 15 for b in beliefs)
+
+
+def test_left_pixels_alone_hold_a_body():
+    rule = lambda k, o: o if k < 4 else replace(o, uv_right=np.full_like(o.uv_right, np.nan))  # noqa: E731
+    found = outcome(box_scene(seed=10, frames=12), rule=rule)
+    assert all(e.measured for e in found.estimates) and found.pose_nees[-4:].mean() < 16

@@ -17,7 +17,7 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp
 from slam.input import warnings
-from slam.input.moment import MomentWatch
+from slam.input.moment import MomentWatch, _lags
 from slam.input.pair import PairGeometry, pair_geometry, points_of, share_shown
 from slam.input.warnings import InputWarnings
 from slam.models import models_for
@@ -274,14 +274,15 @@ def test_a_right_image_that_stays_is_not_used():
 
 
 @pytest.mark.slow
-def test_right_images_of_another_moment_are_doubted():
+@pytest.mark.parametrize(("world", "late"), [("aisle?frames=120", (0, -1, 2)), ("desk?frames=72", (0, 1))])
+def test_right_images_of_another_moment_are_doubted(world, late):
     """Numbers off by one: the run is tracked, with another scale."""
-    sequence = slam.open_sequence("synthetic:desk?frames=72")
+    sequence = slam.open_sequence(f"synthetic:{world}")
     frames = [sequence.frame(k) for k in range(0, len(sequence), 4)]
-    for by in (0, 1):
-        system = slam.StereoSlam(RIG, backend="ekf")
-        for a, b in zip(frames, frames[by:]):
-            system.process(replace(b, right=a.right))
+    for by in late:
+        moments, system = zip(frames, frames[abs(by) :]), slam.StereoSlam(RIG, backend="ekf")
+        for a, b in moments:
+            system.process(replace(b, right=a.right) if by > 0 else replace(a, right=b.right))
         assert ("one moment" in system.doubt) == bool(by) == bool(system.warnings)
 
 
@@ -401,3 +402,12 @@ def test_a_camera_that_hardly_moves_shows_no_lag():
     """Its rows, here off by the lens, and the flow by errors of its poses are alike in all frames."""
     step = np.array([1e-5, 0, 0, 0, 0, 0])
     assert doubt(0.0, lambda rng: step, ([-2, -1.5, 3], [2, 1.5, 9]), 31, lambda x, y: y * y) == ""
+
+
+@pytest.mark.parametrize(("flow", "lag"), [(1.0, 0.5), (0.03, 0.0)])
+def test_a_lag_counts_only_where_the_motion_moves_rows(flow, lag):
+    """A board that moves before a standing camera was taken for right images of another moment."""
+    columns = np.random.default_rng(0).normal(size=(8, 2, 50, 7)) * [0.1 * flow, flow, 1, 1, 1, 1, 1]
+    columns[..., 0] -= 0.5 * columns[..., 1]
+    sums = np.swapaxes(columns, 2, 3) @ columns
+    np.testing.assert_allclose(_lags(sums, sums.sum(axis=0), 0.2), lag, atol=0.02)

@@ -12,10 +12,12 @@ from frontends import create
 from slam.chi_square import chi_square_limit
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
+from slam.geometry import se3
 from slam.geometry.se3 import exp, inverse, log, transform
+from slam.system import StereoSlam
 from slam.tracks.standing import Standing
 from slam.tracks.step import HIDDEN
-from tests.slam.scene import BACKENDS, RIG, features_at
+from tests.slam.scene import BACKENDS, RIG, Cloud, features_at
 
 SIGMA = 0.3
 
@@ -182,3 +184,29 @@ def test_people_who_walk_by_hardly_move_the_camera(street, backend):
     assert np.degrees(np.linalg.norm(errors[:, :3], axis=1).max()) < 0.1
     P = results[-1].estimate.covariance
     assert errors[-1] @ np.linalg.solve(P, errors[-1]) < chi_square_limit(6, 0.999)
+
+
+ROWS = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
+
+
+@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+def test_a_camera_that_something_large_took_along_comes_back(backend):
+    """It stands; something passes, covers all of its view for a second, and moves by more than a metre meanwhile."""
+    world, mover = Cloud(150), Cloud(600, seed=9)
+    mover.points = mover.points * (3, 0.8, 0.15) + (0, 0, 1.2)
+    system = StereoSlam(RIG, None, backend, config=SystemConfig.for_kind("handheld", None))
+    results = []
+    for k in range(85):
+        here, _ = world.features(np.eye(4), k / 30, 0.3)
+        there, _ = mover.features(se3.exp(np.array([0, 0, 0, -0.04 * (k - 10), 0, 0])), k / 30, 0.3)
+        edge = 14.0 * (k - 20)
+        covered = [(f.uv_left[:, 0] < edge) & (f.uv_left[:, 0] > edge - 520) for f in (here, there)]
+        a, b = here.select(~covered[0]), there.select(covered[1])
+        features = replace(a, **{name: np.concatenate([getattr(a, name), getattr(b, name)]) for name in ROWS})
+        results.append(system.process_features(features))
+    off = [float(np.linalg.norm(r.estimate.T_world_left[:3, 3])) for r in results]
+    assert max(off) > 0.3  # taken along: that it is, others see to
+    sigmas = [float(np.sqrt(np.trace(r.estimate.covariance[3:, 3:]))) for r in results]
+    assert all(error < 3 * sigma for error, sigma in zip(off, sigmas))  # it grows where what fills the view changes
+    assert max(off[k] for k, r in enumerate(results) if r.loop == 0) < 0.05
+    assert off[-1] < 0.2 * max(off)
