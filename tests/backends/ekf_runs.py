@@ -12,7 +12,7 @@ from slam.models import EstimatorModels, MotionModel
 from tests.backends.scenes import Scene, path, scene, step
 
 FORWARD, STILL = np.array([0, 0, 1.5]), np.zeros(3)
-YAW = np.array([0, 1.0, 0])
+YAW, ROLL = np.array([0, 1.0, 0]), np.array([0, 0, 1.0])
 MODELS = EstimatorModels(MotionModel(0.3, 0.3), pixel_sigma=0.5)
 DRIVE = scene(path(30, 0.1, FORWARD, 0.3 * YAW), points=300)  # of 30 frames, that turns
 
