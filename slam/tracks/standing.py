@@ -23,7 +23,7 @@ from slam.geometry.arrays import Table, changed, median
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig, measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.tracks.follow import Matches, Windows, follow
-from slam.window.consensus import find_consensus
+from slam.window.consensus import CLEAR_MAJORITY, find_consensus
 
 _FRAMES = 3  # in which a feature stays at its pixel, and in which most do, before that counts
 _GATE = chi_square_limit(3, 0.997)  # of the displacement of a feature that stays
@@ -118,9 +118,9 @@ class Standing:
             return begun
         variance = min(self.variance, 2.0 * sigma**2)
         if wheels and (rest := self._rest()) is not None:
-            fastened, drives, share = _driven_past(rig, sigma, variance, rest, seen)
-            # 0.5: share of the rest's places that must be in view to tell
-            begun = changed(begun, left=rest if share > 0.5 else None, fastened=_joined(self.fastened, fastened))
+            drives, stay = _driven_past(rig, sigma, variance, rest, seen)
+            fastened = stay if self.fastened is None else self.fastened.joined(stay).select(slice(-3000, None))
+            begun = changed(begun, left=rest, fastened=fastened)
             if self.stands and drives:
                 return begun
         pairs = places.found(sigma, seen)
@@ -172,20 +172,12 @@ class Standing:
         return changed(self, frames=0)
 
 
-def _joined(places: Places | None, more: Places) -> Places:
-    """Places, and more of them; 3000 at most."""
-    if places is None or not len(more):
-        return places if places is not None else more if len(more) else None
-    return places.joined(more).select(slice(-3000, None))
-
-
 def _driven_past(
     rig: StereoRig, sigma: float, variance: float, rest: Places, seen: StereoFeatures
-) -> tuple[Places, bool, float]:
-    """Whether the vehicle drives, the places of a `rest` that stay though, and the share of them that are seen.
+) -> tuple[bool, Places]:
+    """Whether the vehicle drives, and the places of a `rest` that stay though.
 
-    It drives if some motion ahead explains more of what left than stays against it: that is fastened to the vehicle.
-    A truck that passes was not there in most of the rest, and moves sideways. The `variance` is of a pixel [px²].
+    It drives if some motion ahead explains far more of what left than stays against it, which is fastened to it. A truck that passes was not there in most of the rest, and moves sideways. The `variance` is of a pixel [px²].
     """
     pairs = rest.found(sigma, seen, (1.0, 10.0))  # 10: windows
     before, now = rest.z[pairs.tracks], measurement_rows(seen.uv_left, seen.uv_right)[pairs.features]
@@ -198,9 +190,11 @@ def _driven_past(
     size = np.square(by_motion).sum(axis=1)
     against = stays & (size > _GATE * variance) & (size > 2.0 * (d * by_motion).sum(axis=1))
     aside, _, ahead = found.T_world_left[:3, 3]
+    moved = found.inliers.sum()
+    clear = moved > CLEAR_MAJORITY * (moved + against.sum())
     # 0.1: share of what is seen that a motion must move, for it to be one
-    drives = found.inliers.sum() > max(against.sum(), 0.1 * len(pairs)) and abs(aside) < ahead
-    return rest.select(pairs.tracks[against & drives]), bool(drives), len(pairs) / max(len(rest), 1)
+    drives = clear and moved > 0.1 * len(pairs) and abs(aside) < ahead
+    return bool(drives), rest.select(pairs.tracks[against & drives])
 
 
 def _flow(rig: StereoRig, z: Array, motion: Array) -> Array:
