@@ -177,7 +177,8 @@ def _driven_past(
 ) -> tuple[bool, Places]:
     """Whether the vehicle drives, and the places of a `rest` that stay though.
 
-    It drives if some motion ahead explains far more of what left than stays against it, which is fastened to it. A truck that passes was not there in most of the rest, and moves sideways. The `variance` is of a pixel [px²].
+    It drives if some motion ahead explains most of what left, and of what it would have moved far more left than stays:
+    that is fastened to the vehicle. What passes came later, or moves sideways. The `variance` is of a pixel [px²].
     """
     pairs = rest.found(sigma, seen, (1.0, 10.0))  # 10: windows
     before, now = rest.z[pairs.tracks], measurement_rows(seen.uv_left, seen.uv_right)[pairs.features]
