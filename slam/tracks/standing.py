@@ -118,9 +118,10 @@ class Standing:
             return begun
         variance = min(self.variance, 2.0 * sigma**2)
         if wheels and (rest := self._rest()) is not None:
-            drives, stay = _driven_past(rig, sigma, variance, rest, seen)
+            drives, stay, share = _driven_past(rig, sigma, variance, rest, seen)
             fastened = stay if self.fastened is None else self.fastened.joined(stay).select(slice(-3000, None))
-            begun = changed(begun, left=rest, fastened=fastened)
+            # 0.5: share of a rest's places below which the vehicle has left them behind
+            begun = changed(begun, left=rest if share > 0.5 else None, fastened=fastened)
             if self.stands and drives:
                 return begun
         pairs = places.found(sigma, seen)
@@ -174,8 +175,8 @@ class Standing:
 
 def _driven_past(
     rig: StereoRig, sigma: float, variance: float, rest: Places, seen: StereoFeatures
-) -> tuple[bool, Places]:
-    """Whether the vehicle drives, and the places of a `rest` that stay though.
+) -> tuple[bool, Places, float]:
+    """Whether the vehicle drives, the places of a `rest` that stay though, and the share of all that is seen.
 
     It drives if some motion ahead explains most of what left, and of what it would have moved far more left than stays:
     that is fastened to the vehicle. What passes came later, or moves sideways. The `variance` is of a pixel [px²].
@@ -195,7 +196,7 @@ def _driven_past(
     clear = moved > CLEAR_MAJORITY * (moved + against.sum())
     # 0.1: share of what is seen that a motion must move, for it to be one
     drives = clear and moved > 0.1 * len(pairs) and abs(aside) < ahead
-    return bool(drives), rest.select(pairs.tracks[against & drives])
+    return bool(drives), rest.select(pairs.tracks[against & drives]), len(pairs) / max(len(rest), 1)
 
 
 def _flow(rig: StereoRig, z: Array, motion: Array) -> Array:
