@@ -98,7 +98,7 @@ class Standing:
     def without_fastened(self, sigma: float, features: StereoFeatures) -> StereoFeatures:
         """The features without what is fastened to the camera, such as a bonnet; `sigma` is the pixel noise [px]."""
         fastened = self.fastened
-        if fastened is None or fastened.descriptors.shape[1] != features.descriptors.shape[1]:
+        if not fastened or fastened.descriptors.shape[1] != features.descriptors.shape[1]:
             return features
         pairs = fastened.found(sigma, features)
         shift = measurement_rows(features.uv_left, features.uv_right)[pairs.features] - fastened.z[pairs.tracks]
@@ -118,8 +118,8 @@ class Standing:
             return begun
         variance = min(self.variance, 2.0 * sigma**2)
         if wheels and (rest := self._rest()) is not None:
-            drives, stay, share = _driven_past(rig, sigma, variance, rest, seen)
-            fastened = stay if self.fastened is None else self.fastened.joined(stay).select(slice(-3000, None))
+            drives, held, share = _driven_past(rig, sigma, variance, rest, seen)
+            fastened = held if self.fastened is None else self.fastened.joined(held).select(slice(-3000, None))
             # 0.5: share of a rest's places below which the vehicle has left them behind
             begun = changed(begun, left=rest if share > 0.5 else None, fastened=fastened)
             if self.stands and drives:
