@@ -128,7 +128,7 @@ class Session:
         tracks = None
         if T is None:
             before = self._tracker.rig_error.added_to(old, old.estimate(landmarks=False))
-            T, standing = before.T_world_left, Standing()
+            T, standing = before.T_world_left, Standing(fastened=state.standing.fastened)
             common = self._tracker.rig_error.common(old, as_reported=False)
             new = self._new(common, T_world_left=T.tolist())
             prediction = new.predict(stamp)

@@ -137,7 +137,8 @@ class Tracker:
 
     def predict(self, state: State, features: StereoFeatures) -> tuple[Standing, Prediction]:
         """Whether the camera stands, and the back end's prediction for the time of the features."""
-        standing = state.standing.after(self.rig, self.config.models.pixel_sigma, features)
+        models = self.config.models
+        standing = state.standing.after(self.rig, models.pixel_sigma, features, models.motion.wheels)
         at_rest = standing.stands and isinstance(state.backend, RestingBackend)
         ask = state.backend.predict_at_rest if at_rest else state.backend.predict  # type: ignore[attr-defined]
         prediction: Prediction = checked(state.backend, "predict", ask(features.stamp))

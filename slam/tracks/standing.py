@@ -22,13 +22,16 @@ from slam.data import StereoFeatures
 from slam.geometry.arrays import Table, changed, median
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig, measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
-from slam.tracks.follow import Windows, follow
+from slam.tracks.follow import Matches, Windows, follow
+from slam.window.consensus import CLEAR_MAJORITY, find_consensus
 
 _FRAMES = 3  # in which a feature stays at its pixel, and in which most do, before that counts
 _GATE = chi_square_limit(3, 0.997)  # of the displacement of a feature that stays
 _MOVES = chi_square_limit(6, 1 - 1e-4)  # of a common motion; asked in every frame
 _MEDIAN = chi_square_limit(3, 0.5)
 _FEW = 2 * MINIMAL_POINTS  # features that tell nothing of a motion
+_SIGHTS = 10  # whose mean is a feature's place; later ones would follow a slow motion
+_HYPOTHESES = 50  # cost: motions tried that may explain what left its pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +50,19 @@ class Places(Table):
         ones = np.ones(len(z), np.int64)
         return cls(z, features.descriptors, features.laplacian, ones, 0 * ones)
 
+    def found(self, sigma: float, features: StereoFeatures, sizes: tuple[float, ...] = (1.0,)) -> Matches:
+        """The features at the places: in a window that noise explains, then in larger ones of these `sizes`."""
+        radius, none = SIGMAS * np.sqrt(2.0) * sigma, np.zeros((len(self), 2, 2))
+        # 0.5: largest distance of descriptors of one feature in unchanged light
+        windows = Windows(sizes, (0.5,) * len(sizes), 1.0, radius, radius)
+        return follow(self.z[:, :2], none, self.descriptors, self.laplacian, features, windows)
+
     def after(self, at: NDArray, rows: NDArray, z: Array, features: StereoFeatures) -> Places:
         """The places after a frame with features (N,) at `z` (N, 3), of which `rows` stayed at the places `at`."""
         sights, missed, mean = self.sights.copy(), self.missed + 1, self.z.copy()
         sights[at] += 1
         missed[at] = 0
-        # 10: sights whose mean is a feature's place; later ones would follow a slow motion
-        share = np.where(sights[at] <= 10, 1.0 / sights[at], 0.0)
+        share = np.where(sights[at] <= _SIGHTS, 1.0 / sights[at], 0.0)
         mean[at] += share[:, None] * (z[rows] - mean[at])
         keep = np.flatnonzero((missed <= sights) | (sights > _FRAMES))
         keep = np.sort(keep[np.argsort(missed[keep], kind="stable")][:3000])  # 3000: features
@@ -74,6 +83,8 @@ class Standing:
     # the camera's pose (4, 4) in the last frame whose images were new
     T_world_left: Array = field(default_factory=lambda: np.eye(4))
     blind: int = 0  # number of frames in which too little of what stays was seen to tell, as something hides it
+    left: Places | None = None  # the places of a rest that a vehicle has just ended; None without one
+    fastened: Places | None = None  # what stayed at its pixels though the camera moved; None if nothing did
 
     @cached_property
     def stands(self) -> bool:
@@ -84,21 +95,39 @@ class Standing:
         """Whether the camera stands at a known place, or something hides what it knows: then no other is looked for."""
         return self.stands and (self.blind > 0 or not lost)
 
-    def after(self, rig: StereoRig, sigma: float, features: StereoFeatures) -> Standing:
-        """What a frame's features with a right pixel say; `sigma` is the pixel noise [px]."""
+    def without_fastened(self, sigma: float, features: StereoFeatures) -> StereoFeatures:
+        """The features without what is fastened to the camera, such as a bonnet; `sigma` is the pixel noise [px]."""
+        fastened = self.fastened
+        if not fastened or fastened.descriptors.shape[1] != features.descriptors.shape[1]:
+            return features
+        pairs = fastened.found(sigma, features)
+        shift = measurement_rows(features.uv_left, features.uv_right)[pairs.features] - fastened.z[pairs.tracks]
+        parted = np.square(shift).sum(axis=1) > _GATE * 2.0 * sigma**2  # of NaN false: a sight without a right pixel
+        return features.select(np.delete(np.arange(len(features)), pairs.features[~parted]))
+
+    def after(self, rig: StereoRig, sigma: float, features: StereoFeatures, wheels: bool = False) -> Standing:
+        """What a frame's features with a right pixel say; `sigma` is the pixel noise [px].
+
+        With `wheels` the camera is on a vehicle, see `MotionModel`.
+        """
         stereo, places = np.flatnonzero(features.has_stereo), self.places
         seen = features.select(stereo)
         z = measurement_rows(seen.uv_left, seen.uv_right)
-        begun = Standing(Places.of(z, seen), T_world_left=self.T_world_left)
+        begun = Standing(Places.of(z, seen), T_world_left=self.T_world_left, fastened=self.fastened)
         if places is None or places.descriptors.shape[1] != seen.descriptors.shape[1]:
             return begun
-        radius, none = SIGMAS * np.sqrt(2.0) * sigma, np.zeros((len(places.z), 2, 2))
-        # 0.5: largest distance of descriptors of one feature in unchanged light
-        near = Windows((1.0,), (0.5,), 1.0, radius, radius)
-        pairs = follow(places.z[:, :2], none, places.descriptors, places.laplacian, seen, near)
+        variance = min(self.variance, 2.0 * sigma**2)
+        if wheels and (rest := self._rest()) is not None:
+            drives, held, share = _driven_past(rig, sigma, variance, rest, seen)
+            fastened = held if self.fastened is None else self.fastened.joined(held).select(slice(-3000, None))
+            # 0.5: share of a rest's places below which the vehicle has left them behind
+            begun = changed(begun, left=rest if share > 0.5 else None, fastened=fastened)
+            if self.stands and drives:
+                return begun
+        pairs = places.found(sigma, seen)
         at, rows = pairs.tracks, pairs.features
         shift = z[rows] - places.z[at]
-        stay = np.square(shift).sum(axis=1) <= _GATE * min(self.variance, 2.0 * sigma**2)
+        stay = np.square(shift).sum(axis=1) <= _GATE * variance
         at, rows, shift = at[stay], rows[stay], shift[stay]
         most = 2 * len(rows) > min(len(z), int((places.missed == 0).sum()))
         if not (self.stands or most):
@@ -107,10 +136,17 @@ class Standing:
         places_after = places.after(at, rows, z, seen)
         at_rest, variance = _at_rest(rig, places.z[at], shift, self.variance)
         if at_rest:
-            return Standing(places_after, self.frames + 1, witnesses, variance, self.T_world_left)
+            frames = self.frames + 1
+            return changed(begun, places=places_after, frames=frames, witnesses=witnesses, variance=variance)
         if self.stands and len(rows) <= _FEW and self.blind < min(self.frames, 10):  # frames: then carried off
             return changed(self, places=places_after, witnesses=witnesses, blind=self.blind + 1)
         return begun
+
+    def _rest(self) -> Places | None:
+        """The places that were there for most of a rest, which lasts or has just ended; None without one."""
+        if self.stands and self.places is not None:
+            return self.places.select(self.places.sights >= min(_SIGHTS, self.frames // 2 + 1))
+        return self.left
 
     def contested(
         self, rig: StereoRig, sigma: float, features: StereoFeatures, matched: NDArray[np.intp], T_world_left: Array
@@ -121,7 +157,9 @@ class Standing:
         """
         motion = inverse(T_world_left) @ self.T_world_left
         left = np.setdiff1d(matched, self.witnesses)
-        moved, witnesses = (_moved(rig, sigma, features, rows, motion) for rows in (left, self.witnesses))
+        flow = _flow(rig, measurement_rows(features.uv_left, features.uv_right), motion)
+        moves = np.square(flow).sum(axis=1) > _GATE * 2.0 * sigma**2
+        moved, witnesses = moves[left].sum(), moves[self.witnesses].sum()
         # 0.1: share of landmarks that a motion must move, for it to be one
         explains = moved > 0.1 * len(matched) and 2 * witnesses < max(len(self.witnesses), 1)
         return self.moving() if explains else self
@@ -135,13 +173,36 @@ class Standing:
         return changed(self, frames=0)
 
 
-def _moved(rig: StereoRig, sigma: float, features: StereoFeatures, rows: NDArray[np.intp], motion: Array) -> int:
-    """Number of some features that a motion (4, 4) of what they see would move by more than noise."""
-    local = rig.triangulate(features.uv_left[rows], features.uv_right[rows])
-    seen = np.isfinite(local).all(axis=1)
-    z = measurement_rows(features.uv_left[rows[seen]], features.uv_right[rows[seen]])
-    pixels, _ = rig.project_stereo(transform(motion, local[seen]), jacobian=False)
-    return int(np.count_nonzero(((pixels - z) ** 2).sum(axis=1) > _GATE * 2.0 * sigma**2))
+def _driven_past(
+    rig: StereoRig, sigma: float, variance: float, rest: Places, seen: StereoFeatures
+) -> tuple[bool, Places, float]:
+    """Whether the vehicle drives, the places of a `rest` that stay though, and the share of all that is seen.
+
+    It drives if some motion ahead explains most of what left, and of what it would have moved far more left than stays:
+    that is fastened to the vehicle. What passes came later, or moves sideways. The `variance` is of a pixel [px²].
+    """
+    pairs = rest.found(sigma, seen, (1.0, 10.0))  # 10: windows
+    before, now = rest.z[pairs.tracks], measurement_rows(seen.uv_left, seen.uv_right)[pairs.features]
+    d = now - before
+    stays = np.square(d).sum(axis=1) <= _GATE * variance
+    points = rig.triangulate(before[:, :2], before[:, [2, 1]])
+    left = ~stays & np.isfinite(points).all(axis=1)
+    found = find_consensus(rig, points[left], now[left], np.eye(4), SIGMAS * sigma, _HYPOTHESES, seed=0)
+    by_motion = _flow(rig, before, inverse(found.T_world_left))
+    size = np.square(by_motion).sum(axis=1)
+    against = stays & (size > _GATE * variance) & (size > 2.0 * (d * by_motion).sum(axis=1))
+    aside, _, ahead = found.T_world_left[:3, 3]
+    moved = found.inliers.sum()
+    clear = moved > CLEAR_MAJORITY * (moved + against.sum())
+    # 0.1: share of what is seen that a motion must move, for it to be one
+    drives = clear and moved > 0.1 * len(pairs) and abs(aside) < ahead
+    return bool(drives), rest.select(pairs.tracks[against & drives]), len(pairs) / max(len(rest), 1)
+
+
+def _flow(rig: StereoRig, z: Array, motion: Array) -> Array:
+    """How a motion (4, 4) of what they see moves features at `z` (N, 3) [px]; NaN for those without a point."""
+    pixels, _ = rig.project_stereo(transform(motion, rig.triangulate(z[:, :2], z[:, [2, 1]])), jacobian=False)
+    return np.asarray(pixels - z)
 
 
 def _at_rest(rig: StereoRig, before: Array, d: Array, variance: float) -> tuple[bool, float]:

@@ -109,6 +109,34 @@ def test_a_truck_that_passes_does_not_take_the_camera_along(backend):
     assert farthest < 1e-2
 
 
+@pytest.mark.parametrize(("backend", "share"), [("ekf", 0.05), ("smoother", 0.05), ("window", 0.05), ("ekf", 0.15)])
+def test_a_bonnet_in_view_does_not_hold_a_car_that_starts_with_a_turn(backend, share):
+    """What stays at its pixels is nearer than all else, so that it would outvote it; it is left out from then on."""
+    scene, camera = Scene(share), np.eye(4)
+    scene.points[scene.body] *= 1.0 / scene.points[scene.body, 2:]
+    scene.points[~scene.body] *= 2.0
+    system = slam.StereoSlam(RIG, backend=backend, kind="driving")
+    for k in range(45):
+        camera = camera @ exp(np.array([0, 0.004, 0, 0, 0, 0.08]) * min(1.0, max(0, k - 14) / 8))
+        fastened = transform(camera, scene.points) - scene.points
+        result = system.process_features(scene.seen(k, camera, fastened, True))
+    assert np.linalg.norm(camera[:3, 3]) > 2.0
+    assert np.linalg.norm(result.estimate.T_world_left[:3, 3] - camera[:3, 3]) < 0.1
+    bonnet = scene.descriptors[scene.body]
+    assert (result.features.descriptors @ bonnet.T > 0.5).any(axis=1).sum() < 0.2 * len(bonnet)
+
+
+@pytest.mark.parametrize("towards", [-0.06, 0.1])
+def test_a_body_that_shows_half_of_the_features_and_starts_does_not_take_a_standing_car_along(towards):
+    scene = Scene(0.5)
+    system = slam.StereoSlam(RIG, backend="ekf", kind="driving")
+    shift = np.zeros(3)
+    for k in range(40):
+        shift[2] += towards * min(1.0, max(0, k - 15) / 8)
+        result = system.process_features(scene.seen(k, np.eye(4), shift, True))
+        assert np.linalg.norm(result.estimate.T_world_left[:3, 3]) < 1e-2
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_standing_camera_does_not_believe_each_frame_for_itself(backend):
     """Light moves its features slowly and alike."""
