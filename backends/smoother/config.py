@@ -18,9 +18,9 @@ class SmootherConfig:
         lag: number of poses with measurements before the newest one that are smoothed with it; older ones are
             marginalised, so that neither time nor memory grows with the run. Null (in Python None) keeps all and
             revises the whole path.
-        landmarks: most landmarks that are variables of the graph. Where a frame measures no more than these, those that
-            are measured for longer than a smart factor spans become variables, and keep what it says of them; but only
-            while they are linear in space to less than a pixel's noise.
+        landmarks: most landmarks that are variables of the graph. Of those that are measured for longer than a smart
+            factor spans, so many keep what it says of them, the first that came; but only while they are linear in
+            space to less than a pixel's noise. The others go on in new factors, and the path drifts more.
         poses: which frames give the graph their measurements: ``"every"`` one, or, for ``"seen"``, those that measure
             no more than half of the landmarks that the last one did, or come half a factor after it. The others are
             solved for alone, from the landmarks as they stand; the graph has their motion, not their measurements.
@@ -33,8 +33,8 @@ class SmootherConfig:
     """
 
     track: int = 20
-    lag: int | None = 16
-    landmarks: int = 20
+    lag: int | None = 12
+    landmarks: int = 40
     poses: str = "every"
     past: int = 50
 

@@ -212,13 +212,13 @@ def test_a_place_in_the_world_that_is_hardly_known_does_not_move():
 
 def test_what_is_known_of_a_landmark_outlasts_the_poses_that_measured_it():
     """It was found anew from the measurements of those poses alone that were kept: .09 m and .40 m off for .03 m."""
-    backend, known = SmootherBackend(RIG, MODELS, past=10), set()
+    backend, known = SmootherBackend(RIG, MODELS, past=10, landmarks=0), set()  # variables move for longer
     seen_last: dict[int, tuple[int, np.ndarray, np.ndarray]] = {}
     for k, (stamp, _, seen) in enumerate(drive(90, points=500)):
         step(backend, stamp, seen, known)
         marks = backend.state.landmarks
         for i, last, position, own in zip(marks.ids.tolist(), marks.pose.max(axis=1), marks.position, marks.own):
-            if last == k - 17:  # by now it stands still: its poses have left the lag
+            if last == k - 13:  # by now it stands still: its poses have left the lag
                 seen_last[i] = last, position, own
     old = [i for i, (last, *_) in seen_last.items() if last == marks.pose.max(axis=1)[marks.rows_of([i])[0]]]
     assert len(old) > 15 and backend.state.first > 40
@@ -228,11 +228,13 @@ def test_what_is_known_of_a_landmark_outlasts_the_poses_that_measured_it():
     assert np.linalg.eigvalsh(backend.estimate().covariances).min() > 0, "also where no pose is kept any more"
 
 
-def test_landmarks_behind_the_camera_are_as_uncertain_as_when_they_were_seen_last():
+@pytest.mark.parametrize("landmarks", [0, 40])
+def test_landmarks_behind_the_camera_are_as_uncertain_as_when_they_were_seen_last(landmarks):
     """Their measurements were taken for some of a later pose, which sees nothing behind it: a median NEES of 70."""
-    poses, known = path(100, DT, np.array([0.0, 0.0, 4.0]), np.zeros(3)), set()
+    poses, known = path(90, DT, np.array([0.0, 0.0, 4.0]), np.zeros(3)), set()
     models = EstimatorModels(MotionModel(1.0, 0.3), 0.7, initial_velocity_sigma=15.0)
-    backend, data, then = SmootherBackend(RIG, models), scene(poses, points=1000, limit=40, sigma=0.7), {}
+    backend = SmootherBackend(RIG, models, landmarks=landmarks)
+    data, then = scene(poses, points=1000, limit=40, sigma=0.7), {}
     for stamp, _, seen in data:
         step(backend, stamp, seen, known)
         found = backend.estimate()
@@ -351,7 +353,7 @@ def test_right_pixels_are_mended_afterwards(options):
         return se3.inverse(poses[0]) @ poses
 
     off = [errors(shape(backend), data.poses)[0].max() for backend in (right, mended, spoilt)]
-    assert off[1] < off[0] + 0.005 < off[2], off
+    assert off[1] < off[0] + 0.006 < off[2], off  # poses that had left the lag keep their places to each other
     ours, theirs = mended.estimate(), right.estimate()
     np.testing.assert_array_equal(ours.ids, theirs.ids)
     local, truth = (se3.transform(se3.inverse(e.T_world_left), e.positions) for e in (ours, theirs))
@@ -360,10 +362,14 @@ def test_right_pixels_are_mended_afterwards(options):
     assert np.median((np.linalg.norm(local - truth, axis=1) / deviations)[seen]) < 0.6  # of its own uncertainty
 
 
-def test_a_revision_that_changes_nothing_leaves_the_covariances():
-    """Up to what poses that have left the lag told of it: the graph is built anew from the poses of the lag alone."""
+@pytest.mark.parametrize("landmarks", [0, 40])
+def test_a_revision_that_changes_nothing_leaves_the_covariances(landmarks):
+    """Up to what poses that have left the lag told of it: the graph is built anew from the poses of the lag alone.
+
+    Not where landmarks are variables: theirs were up to 2.5 times as large afterwards.
+    """
     data = drive(30, points=250)
-    backend = tracked(data)
+    backend = tracked(data, landmarks=landmarks)
     before = backend.estimate()
     backend.revise(lambda z: z)
     after = backend.estimate()
