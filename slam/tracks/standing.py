@@ -1,9 +1,10 @@
 """Whether the camera stands: a test of what its images show, whatever moves in front of it.
 
-A camera stands if most features stay at their pixels and no small motion explains the rest of what is left of noise.
-Once it stands, features that stay where they were are witnesses, however few a passing body leaves of them: a motion of
-the camera would move them too. It is over as soon as some motion of the camera explains witnesses and moving features
-alike. While the camera stands, only features that stay are used to measure its pose and to make landmarks.
+A camera stands if most features that are found again stay at their pixels, and no small motion explains the rest of
+what is left of noise. Once it stands, features that stay where they were are witnesses, however few a passing body
+leaves of them: a motion of the camera would move them too. It is over as soon as some motion of the camera explains
+witnesses and moving features alike. While the camera stands, only features that stay are used to measure its pose and
+to make landmarks.
 
 Places are pixels and no points of the world: they are compared with the features before the pose is predicted, as how
 it is predicted depends on them, and they have neither a depth nor a prediction of their own. So they are no tracks.
@@ -22,13 +23,14 @@ from slam.data import StereoFeatures
 from slam.geometry.arrays import Table, changed, median
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig, measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
-from slam.tracks.follow import Matches, Windows, follow
+from slam.tracks.follow import Matches, Windows, follow, match_everywhere
 from slam.window.consensus import CLEAR_MAJORITY, find_consensus
 
 _FRAMES = 3  # in which a feature stays at its pixel, and in which most do, before that counts
 _GATE = chi_square_limit(3, 0.997)  # of the displacement of a feature that stays
 _MOVES = chi_square_limit(6, 1 - 1e-4)  # of a common motion; asked in every frame
 _MEDIAN = chi_square_limit(3, 0.5)
+_ALIKE = 0.5, 0.8  # largest descriptor distance, and its largest ratio to the second best
 _FEW = 2 * MINIMAL_POINTS  # features that tell nothing of a motion
 _SIGHTS = 10  # whose mean is a feature's place; later ones would follow a slow motion
 _HYPOTHESES = 50  # cost: motions tried that may explain what left its pixels
@@ -82,7 +84,9 @@ class Standing:
     variance: float = np.inf  # of a pixel of a feature that stays [px²], as seen so far; infinite before anything was
     # the camera's pose (4, 4) in the last frame whose images were new
     T_world_left: Array = field(default_factory=lambda: np.eye(4))
-    blind: int = 0  # number of frames in which too little of what stays was seen to tell, as something hides it
+    # frames in which too little of what stays was seen to tell, as something hides it, or which was the first to say
+    # that it moves: light that changes says so once, a camera that moves goes on
+    blind: int = 0
     left: Places | None = None  # the places of a rest that a vehicle has just ended; None without one
     fastened: Places | None = None  # what stayed at its pixels though the camera moved; None if nothing did
 
@@ -129,8 +133,7 @@ class Standing:
         shift = z[rows] - places.z[at]
         stay = np.square(shift).sum(axis=1) <= _GATE * variance
         at, rows, shift = at[stay], rows[stay], shift[stay]
-        most = 2 * len(rows) > min(len(z), int((places.missed == 0).sum()))
-        if not (self.stands or most):
+        if not (self.stands or _most_stay(places, seen, rows)):
             return begun
         witnesses = stereo[rows[places.sights[at] >= _FRAMES]]
         places_after = places.after(at, rows, z, seen)
@@ -138,7 +141,8 @@ class Standing:
         if at_rest:
             frames = self.frames + 1
             return changed(begun, places=places_after, frames=frames, witnesses=witnesses, variance=variance)
-        if self.stands and len(rows) <= _FEW and self.blind < min(self.frames, 10):  # frames: then carried off
+        hidden = min(self.frames, 10) if len(rows) <= _FEW else 1  # frames: then carried off, or moving
+        if self.stands and self.blind < hidden:
             return changed(self, places=places_after, witnesses=witnesses, blind=self.blind + 1)
         return begun
 
@@ -171,6 +175,19 @@ class Standing:
     def moving(self) -> Standing:
         """The same features, of a camera that does not stand."""
         return changed(self, frames=0)
+
+
+def _most_stay(places: Places, seen: StereoFeatures, rows: NDArray[np.intp]) -> bool:
+    """Whether most of what is found again stays, as `rows` (M,) of the features do.
+
+    What is found nowhere says nothing: leaves and shadows are other features in each frame.
+    """
+    last = places.select(places.missed == 0)
+    every = min(len(seen), len(last))
+    if 2 * len(rows) > every or 4 * len(rows) <= every:  # 4: fewer may be fastened to the camera
+        return 2 * len(rows) > every
+    found = match_everywhere(last.descriptors, last.laplacian, seen, *_ALIKE)
+    return 2 * len(rows) > len(np.union1d(rows, found.features))
 
 
 def _driven_past(

@@ -57,6 +57,34 @@ def test_a_camera_at_rest_is_never_taken_for_moving_by_noise(seed):
         assert standing.frames == k
 
 
+@pytest.mark.parametrize(("share", "stands"), [(0.0, True), (0.6, False)], ids=["leaves", "a body"])
+def test_features_that_are_found_nowhere_again_say_nothing(share, stands):
+    """With leaves and shadows, others in each frame, a camera at rest was taken for moving: it drifted by 1 cm."""
+    scene, frames = Scene(share), []
+    for k in range(8):
+        shift = np.array([0.05 * k, 0.0, 0.0])
+        seen, others = scene.seen(k, np.eye(4), shift), Scene(0.0, seed=10 + k).seen(k, np.eye(4), np.zeros(3))
+        if stands:
+            z = np.concatenate([f.uv_left for f in (seen.select(slice(160)), others.select(slice(240)))])
+            right = np.concatenate([f.uv_right for f in (seen.select(slice(160)), others.select(slice(240)))])
+            seen = features_at(z, right, np.concatenate([seen.descriptors[:160], others.descriptors[:240]]), 0.1 * k)
+        frames.append(seen)
+    assert after(frames).stands is stands
+
+
+def test_one_frame_in_which_all_seems_to_move_does_not_end_a_rest():
+    """Light that changes moves all features; a camera that moves goes on."""
+    scene = Scene(0.0)
+    frames = [scene.seen(k, np.eye(4), np.zeros(3)) for k in range(20)]
+    apart = np.array([0.0, 0.4])
+    moved = [replace(f, uv_left=f.uv_left + apart, uv_right=f.uv_right + apart) for f in frames]
+    rest = after(frames[:8])
+    once = rest.after(RIG, SIGMA, moved[8])
+    assert once.frames == rest.frames and once.blind == 1
+    assert once.after(RIG, SIGMA, frames[9]).blind == 0
+    assert not once.after(RIG, SIGMA, moved[9]).stands
+
+
 @pytest.mark.parametrize("motion", [[0, 0, 0, 0.01, 0, 0], [0, 0, 0, 0, 0, 0.04], [0, 0.002, 0, 0, 0, 0]])
 def test_a_camera_that_moves_slowly_does_not_stand(motion):
     scene = Scene(0.0)
