@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from slam.bounds import require_not_negative
-from slam.errors import ConfigurationError
 
 
 @dataclass(frozen=True)
@@ -21,9 +20,6 @@ class SmootherConfig:
         landmarks: most landmarks that are variables of the graph. Of those that are measured for longer than a smart
             factor spans, so many keep what it says of them, the first that came; but only while they are linear in
             space to less than a pixel's noise. The others go on in new factors, and the path drifts more.
-        poses: which frames give the graph their measurements: ``"every"`` one, or, for ``"seen"``, those that measure
-            no more than half of the landmarks that the last one did, or come half a factor after it. The others are
-            solved for alone, from the landmarks as they stand; the graph has their motion, not their measurements.
         past: number of poses before those of the lag, at least, whose measurements are kept (half as many poses more
             before they are thrown away): where landmarks are seen again, or measurements are mended, they say where
             those are.
@@ -34,12 +30,9 @@ class SmootherConfig:
 
     track: int = 20
     lag: int | None = 12
-    landmarks: int = 40
-    poses: str = "every"
+    landmarks: int = 20
     past: int = 50
 
     def __post_init__(self) -> None:
         ranges = {"track": (2, 10**6), "lag": (2, 10**6), "landmarks": (0, 10**6), "past": (0, 10**6)}
         require_not_negative(self, ranges, "smoother")
-        if self.poses not in ("every", "seen"):
-            raise ConfigurationError(f"smoother: poses must be every or seen, got {self.poses!r}")

@@ -14,8 +14,8 @@ from backends.smoother.graph import Graph, Solved, SolverError
 from backends.smoother.landmarks import SmootherLandmarks, inverses
 from backends.smoother.state import Known, Sight, SmootherState
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
-from slam.geometry.se3 import Array, adjoint, exp, inverse, log, points_by_pose, transform
-from slam.window import pose_only, solver
+from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
+from slam.window import pose_only
 from slam.window.consensus import landmarks_pose
 from slam.window.gating import MIN_CONSENSUS
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
@@ -23,7 +23,6 @@ from slam.window.stereo import RectifiedMeasurement
 
 _DARK = 100  # cost: frames without a measurement after which half of them leave: they would be poses of the graph
 _AGAIN = 2  # numerics: steps of Gauss and Newton after the usual ones where measurements were corrected
-_SAME = 0.5  # share of a pose's landmarks that another one must measure to say nothing new
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +87,8 @@ class Steps(RectifiedMeasurement):
                 one, start, lambda: landmarks_pose(self, one.points, z, one.predicted, s.number), s.contradicted, lost
             )
             s = replace(s, contradicted=found.contradicted)
-            # where the turn is unknown, few are linearised where it is not; of `seen` poses more is known than that
-            turned = self.config.poses == "every" and unknown_turn(s.relative)
-            if (turned and found.used.sum() < MIN_CONSENSUS) or not found.used.any():
+            # where the turn is unknown, few are linearised where it is not
+            if (unknown_turn(s.relative) and found.used.sum() < MIN_CONSENSUS) or not found.used.any():
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", ids.copy())
             after, nis, why = self._corrected(s, graph, one, found, rows, z)
         except (np.linalg.LinAlgError, SolverError) as error:
@@ -120,11 +118,6 @@ class Steps(RectifiedMeasurement):
         x = log(inverse(one.predicted) @ found.T)
         nis = float(one.distances(found.T).sum() + x @ one.information @ x)
         s = self._considered(s, one, found.T, seen)
-        if self.config.poses == "seen" and self._saw_the_same(s, marks.serial[seen]):
-            H = np.tril(solver.linearised(one.window(found.T)).H)
-            information = H + np.tril(H, -1).T - one.information
-            if np.linalg.eigvals(np.linalg.solve(one.information, information)).real.min() > 1:  # more than the motion
-                return _alone(s, found.T, information), nis, ""
         ratio = math.sqrt(self.stereo.f / self.models.pixel_sigma)
         after = replace(_seeing(s), poses=np.concatenate([s.poses[:-1], found.T[None]]))
         last, tick = s.tick(marks.pose.max(axis=1, initial=-1)), int(after.ticks[-1])
@@ -170,12 +163,6 @@ class Steps(RectifiedMeasurement):
         marks = marks.measured(rows, z, s.number, since, oldest)
         sight = s.sights[-1].joined(Sight(marks.serial[rows], since, z))
         return replace(s, landmarks=marks, sights=(*s.sights[:-1], sight))
-
-    def _saw_the_same(self, s: SmootherState, serials: IdArray) -> bool:
-        """Whether the newest pose measured at least half of what the last one in the graph did, not long ago."""
-        near = s.begun <= s.solved and s.number - s.solved <= min(self.track // 2, _DARK - 1)
-        last = s.sights[s.of(s.solved)].serials if near else serials[:0]
-        return bool(np.isin(last, serials).sum() > _SAME * len(last))
 
     def _settled(self, s: SmootherState, solved: Solved) -> SmootherState:
         """The state with what the graph says: the newest pose is the anchor."""
@@ -274,20 +261,6 @@ def _begun(s: SmootherState, T: Array, P: Array) -> SmootherState:
         joint=np.pad(P, (0, 12)), prior=P, start=T, begun=s.number, anchor=s.number, landmarks=marks,
         known={serial: one for serial, one in s.known.items() if one.pose < 0},
     )  # fmt: skip
-
-
-def _alone(s: SmootherState, T: Array, information: Array) -> SmootherState:
-    """With the newest pose at T (4, 4), by measurements with an information (6, 6) that the graph is not given.
-
-    The next poses are not known better by it: their measurements would be taken for independent of these, though the
-    landmarks' errors are the same.
-    """
-    before = np.linalg.inv(s.relative)
-    less = before - before @ np.linalg.inv(before + information) @ before
-    earlier = s.poses[-2] @ exp(s.gain @ log(inverse(s.poses[-1]) @ T))
-    P = joint.in_world(s.joint - s.joint[:, 12:] @ less @ s.joint[12:], s.poses[s.of(s.anchor)], T)
-    poses = np.concatenate([s.poses[:-2], earlier[None], T[None]])
-    return replace(s, poses=poses, covariances=np.concatenate([s.covariances[:-1], P[None]]))
 
 
 def _anchored(s: SmootherState) -> SmootherState:
