@@ -20,13 +20,12 @@ from slam.geometry.rig import MINIMAL_POINTS, measurement_rows
 from slam.geometry.se3 import Array, inverse, transform
 from slam.object_data import ObjectObservations
 from slam.tracks import follow as features_of_tracks
-from slam.tracks.follow import match_everywhere
+from slam.tracks.follow import ALIKE, match_everywhere
 from slam.tracks.table import Tracks
 from slam.window.consensus import find_consensus
 from slam.window.gating import MIN_CONSENSUS
 
 _SEARCH = 4.0, 25.0  # least and largest half size of the search windows of tracks [px]
-_ALIKE = 0.5, 0.8  # largest descriptor distance, and its largest ratio to the second best
 _UNKNOWN = 1e-6  # numerics: on a member's point that has no information yet [1/m²]
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
 _POSES = 200  # cost: poses of a body that are tried where its place is not known
@@ -78,7 +77,7 @@ def _look(tracks: Tracks, frame: Frame, rows: IndexArray, taken: BoolArray) -> N
         (reach, _UNEVEN * reach),
     )  # fmt: skip
     least = np.where(tracks.doubtful[rows], 0.5 * _SEARCH[1], _SEARCH[0])
-    windows = features_of_tracks.Windows((SIGMAS,), (_ALIKE[0],), _ALIKE[1], _SEARCH[1], least)
+    windows = features_of_tracks.Windows((SIGMAS,), (ALIKE[0],), ALIKE[1], _SEARCH[1], least)
     looks = tracks.look[rows], tracks.laplacian[rows]
     found = features_of_tracks.follow(z[:, :2], S[:, :2, :2], *looks, f, windows, taken)
     m, row = found.tracks, found.features
@@ -99,7 +98,7 @@ def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
     places, variances = tracks.position[left], np.einsum("nii->n", tracks.covariance[left])
     found = features_of_tracks.match_near(
         tracks.look[left], tracks.laplacian[left], places, variances, frame.features, points,
-        2.0 * s.depth_noise(frame.local[:, 2]) ** 2, (c.max_speed * frame.dt, SIGMAS), *_ALIKE,
+        2.0 * s.depth_noise(frame.local[:, 2]) ** 2, (c.max_speed * frame.dt, SIGMAS), *ALIKE,
     )  # fmt: skip
     tracks.set_features(left[found.tracks], found.features)
 
@@ -138,7 +137,7 @@ def found_again(body: Body, tracks: Tracks, frame: Frame) -> Array | None:
     s, f = frame.setup, frame.features
     mine = np.flatnonzero(tracks.body == body.id)
     free = np.flatnonzero(~among(len(f), tracks.row[tracks.found & (tracks.body >= 0)]))
-    matches = match_everywhere(tracks.look[mine], tracks.laplacian[mine], f.select(free), *_ALIKE)
+    matches = match_everywhere(tracks.look[mine], tracks.laplacian[mine], f.select(free), *ALIKE)
     rows, seen = mine[matches.tracks], free[matches.features]
     z, guess = measurement_rows(f.uv_left[seen], f.uv_right[seen]), inverse(body.T) @ frame.T_world_left
     found = find_consensus(s.rig, tracks.local[rows], z, guess, SIGMAS * s.sigma, _POSES, 0)

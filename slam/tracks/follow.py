@@ -19,6 +19,8 @@ from slam.runtime.compilation import helper, kernel, vector_helper
 
 Descriptors = NDArray[np.float32]
 
+ALIKE = 0.5, 0.8  #: largest descriptor distance of one feature in like light, and its largest ratio to the second best
+
 
 @dataclass(frozen=True, eq=False)
 class Matches(Table):

@@ -23,14 +23,13 @@ from slam.data import StereoFeatures
 from slam.geometry.arrays import Table, changed, median
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig, measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
-from slam.tracks.follow import Matches, Windows, follow, match_everywhere
+from slam.tracks.follow import ALIKE, Matches, Windows, follow, match_everywhere
 from slam.window.consensus import CLEAR_MAJORITY, find_consensus
 
 _FRAMES = 3  # in which a feature stays at its pixel, and in which most do, before that counts
 _GATE = chi_square_limit(3, 0.997)  # of the displacement of a feature that stays
 _MOVES = chi_square_limit(6, 1 - 1e-4)  # of a common motion; asked in every frame
 _MEDIAN = chi_square_limit(3, 0.5)
-_ALIKE = 0.5, 0.8  # largest descriptor distance, and its largest ratio to the second best
 _FEW = 2 * MINIMAL_POINTS  # features that tell nothing of a motion
 _SIGHTS = 10  # whose mean is a feature's place; later ones would follow a slow motion
 _HYPOTHESES = 50  # cost: motions tried that may explain what left its pixels
@@ -55,8 +54,7 @@ class Places(Table):
     def found(self, sigma: float, features: StereoFeatures, sizes: tuple[float, ...] = (1.0,)) -> Matches:
         """The features at the places: in a window that noise explains, then in larger ones of these `sizes`."""
         radius, none = SIGMAS * np.sqrt(2.0) * sigma, np.zeros((len(self), 2, 2))
-        # 0.5: largest distance of descriptors of one feature in unchanged light
-        windows = Windows(sizes, (0.5,) * len(sizes), 1.0, radius, radius)
+        windows = Windows(sizes, ALIKE[:1] * len(sizes), 1.0, radius, radius)
         return follow(self.z[:, :2], none, self.descriptors, self.laplacian, features, windows)
 
     def after(self, at: NDArray, rows: NDArray, z: Array, features: StereoFeatures) -> Places:
@@ -186,7 +184,7 @@ def _most_stay(places: Places, seen: StereoFeatures, rows: NDArray[np.intp]) -> 
     every = min(len(seen), len(last))
     if 2 * len(rows) > every or 4 * len(rows) <= every:  # 4: fewer may be fastened to the camera
         return 2 * len(rows) > every
-    found = match_everywhere(last.descriptors, last.laplacian, seen, *_ALIKE)
+    found = match_everywhere(last.descriptors, last.laplacian, seen, *ALIKE)
     return 2 * len(rows) > len(np.union1d(rows, found.features))
 
 

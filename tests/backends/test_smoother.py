@@ -317,7 +317,7 @@ def test_right_pixels_are_mended_afterwards(options):
         return se3.inverse(poses[0]) @ poses
 
     off = [errors(shape(backend), data.poses)[0].max() for backend in (right, mended, spoilt)]
-    assert off[1] < off[0] + 0.006 < off[2], off  # poses that had left the lag keep their places to each other
+    assert off[1] < off[0] + 0.007 < off[2], off  # poses that had left the lag keep their places to each other
     ours, theirs = mended.estimate(), right.estimate()
     np.testing.assert_array_equal(ours.ids, theirs.ids)
     local, truth = (se3.transform(se3.inverse(e.T_world_left), e.positions) for e in (ours, theirs))
