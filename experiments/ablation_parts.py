@@ -72,7 +72,12 @@ def nothing_parts() -> AbstractContextManager[object]:
 
 
 #: Settings with which every part that may be worth something is on, by kind of motion.
-BASE = {"driving": ("association.align=true", "map.target_in_view=150", "backend.landmarks=euclidean"), "handheld": ()}
+BASE = {
+    "driving": (
+        "association.align=true", "map.max_landmarks=200", "map.target_in_view=150", "backend.landmarks=euclidean",
+    ),
+    "handheld": (),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
