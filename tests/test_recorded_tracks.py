@@ -112,7 +112,7 @@ def test_far_tracks_alone_do_not_make_it_run_away(slam_data, name, wrong):
     [
         ("ekf", {}),
         ("iekf", {}),
-        *(pytest.param("smoother", o, marks=pytest.mark.slow) for o in ({}, {"poses": "seen"})),
+        pytest.param("smoother", {}, marks=pytest.mark.slow),
         ("window", {}),
     ],
 )

@@ -86,7 +86,7 @@ class Standing:
     # that it moves: light that changes says so once, a camera that moves goes on
     blind: int = 0
     left: Places | None = None  # the places of a rest that a vehicle has just ended; None without one
-    fastened: Places | None = None  # what stayed at its pixels though the camera moved; None if nothing did
+    fastened: Places | None = None  # what stayed at its pixels as a vehicle drove off, until it stands; None if nothing
 
     @cached_property
     def stands(self) -> bool:
@@ -121,7 +121,7 @@ class Standing:
         variance = min(self.variance, 2.0 * sigma**2)
         if wheels and (rest := self._rest()) is not None:
             drives, held, share = _driven_past(rig, sigma, variance, rest, seen)
-            fastened = held if self.fastened is None else self.fastened.joined(held).select(slice(-3000, None))
+            fastened = held if self.fastened is None else self.fastened.joined(held)
             # 0.5: share of a rest's places below which the vehicle has left them behind
             begun = changed(begun, left=rest if share > 0.5 else None, fastened=fastened)
             if self.stands and drives:
@@ -138,7 +138,11 @@ class Standing:
         at_rest, variance = _at_rest(rig, places.z[at], shift, self.variance)
         if at_rest:
             frames = self.frames + 1
-            return changed(begun, places=places_after, frames=frames, witnesses=witnesses, variance=variance)
+            # at the next rest it is found anew: if it was not fastened, but still, this would else not be seen again
+            known = None if frames > _FRAMES else begun.fastened
+            return changed(
+                begun, places=places_after, frames=frames, witnesses=witnesses, variance=variance, fastened=known
+            )
         hidden = min(self.frames, 10) if len(rows) <= _FEW else 1  # frames: then carried off, or moving
         if self.stands and self.blind < hidden:
             return changed(self, places=places_after, witnesses=witnesses, blind=self.blind + 1)
@@ -178,13 +182,13 @@ class Standing:
 def _most_stay(places: Places, seen: StereoFeatures, rows: NDArray[np.intp]) -> bool:
     """Whether most of what is found again stays, as `rows` (M,) of the features do.
 
-    What is found nowhere says nothing: leaves and shadows are other features in each frame.
+    What is found nowhere says nothing: leaves and shadows are other features in each one.
     """
     last = places.select(places.missed == 0)
     every = min(len(seen), len(last))
-    if 2 * len(rows) > every or 4 * len(rows) <= every:  # 4: fewer may be fastened to the camera
+    if 2 * len(rows) > every or 3 * len(rows) <= every:  # 3: fewer may be fastened to the camera
         return 2 * len(rows) > every
-    found = match_everywhere(last.descriptors, last.laplacian, seen, *ALIKE)
+    found = match_everywhere(last.descriptors, last.laplacian, seen, ALIKE[0], 1.0)  # 1: also what repeats itself
     return 2 * len(rows) > len(np.union1d(rows, found.features))
 
 

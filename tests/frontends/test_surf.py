@@ -49,6 +49,16 @@ def test_layouts_give_the_same_bytes(plain, change):
     assert descriptors.tobytes() == plain[1].tobytes()
 
 
+@pytest.mark.parametrize("kind", ["<u2", ">u2"])
+def test_16_bit_images_are_on_the_scale_of_8_bit_ones(plain, kind):
+    keypoints, descriptors = Surf(300).detect_and_describe((IMAGE.astype(np.uint16) * 257).astype(kind))
+    assert len(keypoints) == len(plain[0])
+    # Only the rounding of single-precision products differs.
+    np.testing.assert_allclose(keypoints.uv, plain[0].uv, atol=1e-3)
+    np.testing.assert_allclose(keypoints.response, plain[0].response, rtol=1e-4)
+    np.testing.assert_allclose(descriptors, plain[1], atol=1e-3)
+
+
 def test_sums_beyond_32_bits_wrap_around_harmlessly():
     bright = np.full((360, 2700), 60000, np.uint16)  # sums of the rows of one filter wrap around, too
     bright[60:300, 2340:2660] = IMAGE[:240, :320].astype(np.uint16) + 59000

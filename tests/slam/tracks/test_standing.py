@@ -154,6 +154,18 @@ def test_a_bonnet_in_view_does_not_hold_a_car_that_starts_with_a_turn(backend, s
     assert (result.features.descriptors @ bonnet.T > 0.5).any(axis=1).sum() < 0.2 * len(bonnet)
 
 
+def test_what_was_taken_for_fastened_is_seen_again_at_the_next_rest():
+    scene, found = Scene(0.0), []
+    frames = [scene.seen(k, np.eye(4), np.zeros(3)) for k in range(6)]
+    standing = after(frames[:1])
+    assert standing.places is not None
+    standing = replace(standing, fastened=standing.places.select(slice(50)))
+    for features in frames[1:]:
+        standing = standing.after(RIG, SIGMA, features, wheels=True)
+        found.append((standing.stands, standing.fastened is None, len(standing.without_fastened(SIGMA, features))))
+    assert found[0][:2] == (False, False) and found[0][2] < 360 and found[-1] == (True, True, 400)
+
+
 @pytest.mark.parametrize("towards", [-0.06, 0.1])
 def test_a_body_that_shows_half_of_the_features_and_starts_does_not_take_a_standing_car_along(towards):
     scene = Scene(0.5)
