@@ -17,9 +17,9 @@ class SmootherConfig:
         lag: number of poses with measurements before the newest one that are smoothed with it; older ones are
             marginalised, so that neither time nor memory grows with the run. Null (in Python None) keeps all and
             revises the whole path.
-        landmarks: most landmarks that are variables of the graph. Of those that are measured for longer than a smart
-            factor spans, so many keep what it says of them, the first that came; but only while they are linear in
-            space to less than a pixel's noise. The others go on in new factors, and the path drifts more.
+        landmarks: most landmarks that are variables of the graph. Where a frame measures no more than these, those that
+            are measured for longer than a smart factor spans become variables, and keep what it says of them; but only
+            while they are linear in space to less than a pixel's noise.
         past: number of poses before those of the lag, at least, whose measurements are kept (half as many poses more
             before they are thrown away): where landmarks are seen again, or measurements are mended, they say where
             those are.
@@ -29,7 +29,7 @@ class SmootherConfig:
     """
 
     track: int = 20
-    lag: int | None = 12
+    lag: int | None = 16
     landmarks: int = 20
     past: int = 50
 

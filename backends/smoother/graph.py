@@ -100,26 +100,19 @@ class Graph:
         self._solver = gtsam.IncrementalFixedLagSmoother(lag, parameters)
         self._tracks = Tracks(self._make)
         self._careful = max(self._careful, s.number + 1)
-        # what landmarks that are variables told lies before the lag: that leaves once all is solved for
-        oldest = max(s.begun, s.first) if s.landmarks.variables else s.oldest(self._lag, s.number)
-        self.number, self._revisions = -1, s.revisions
+        oldest, self.number, self._revisions = s.oldest(self._lag, s.number), -1, s.revisions
         self.to_state = np.eye(4)
         self._start = s.poses[s.of(oldest)]  # the first pose; its covariance in the world besides its prior is `_base`
         prior, self._base = first_prior(s, oldest)
         update = GraphUpdate(self._make)
         update.factors.add(self._make.prior(oldest, s.start if oldest == s.begun else self._start, prior))
-        return self._solve(s, update, oldest, steps, hold)
+        return self._solve(s, update, steps, hold)
 
-    def _solve(
-        self, s: SmootherState, update: GraphUpdate, begin: int = -1, steps: int = 0, hold: bool = False
-    ) -> Solved:
-        """The solution with what is in an update, the poses that the graph lacks, and what was measured from them.
-
-        A new graph begins with the pose number `begin`.
-        """
+    def _solve(self, s: SmootherState, update: GraphUpdate, steps: int = 0, hold: bool = False) -> Solved:
+        """The solution with what is in an update, the poses that the graph lacks, and what was measured from them."""
         last, self.number = self.number, -1  # until it is done: an interrupted call leaves a graph unknown
         oldest = s.oldest(self._lag, s.number)
-        begin = min(oldest, last) if begin < 0 else begin  # more than a lag of poses may have come since the last one
+        begin = oldest if last < 0 else min(oldest, last)  # more than a lag of poses may have come since the last one
         for number in range(begin if last < 0 else last + 1, s.number + 1):
             if number > begin:
                 self._tracks.add_rows(update, s, number - 1, begin, self._taken)
@@ -128,18 +121,16 @@ class Graph:
             self._taken = len(s.sights[s.of(number)])
         kept = self._tracks.keep(update, s)
         made = self._tracks.make_smart(update)
-        # Two steps of Gauss and Newton, as the newest pose may be far from where it was put. What leaves does so in the
-        # first: in a step of its own all would be eliminated again. Of a new graph more than one pose leaves, and they
-        # are solved for before.
-        first, second = ({}, update.timestamps) if last < 0 else (update.timestamps, {})
+        # Two steps of Gauss and Newton. What leaves the lag fixes where its neighbours stay linearised, and that is to
+        # be where they are once the newest pose is solved for: without timestamps, nothing leaves in the first step.
         with solving():
-            self._solver.update(update.factors, update.values, first, update.removed)
+            self._solver.update(update.factors, update.values, {}, update.removed)
             slots = self._solver.getISAM2Result().getNewFactorsIndices()
             for _ in range(steps):
                 self._solver.update()
-            self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), second)
+            self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), update.timestamps)
             values = self._solver.calculateEstimate()
-        if s.number >= self._careful and self._tracks.contradicted(s, values):
+        if s.number >= self._careful and self._tracks.contradicted():
             raise SolverError("a near landmark lies behind a camera that measured it")
         for track, place in made:
             track.slot = slots[place]

@@ -104,15 +104,18 @@ class SmootherLandmarks(LandmarkRows):
 
         The pose is at a `tick`, and those that measured the landmarks last are at ticks `last` (S,), −1 for none.
 
-        A landmark becomes a variable when its smart factor is full: then it keeps what that says of it, as the
-        measurements go over. Those that came first do, as long as there is room: of the variables that were not
-        measured for half as long as a factor spans, those that were measured longest ago make it.
+        Where it measures more, none becomes one: many landmarks that come and go hold the path well enough, at half the
+        cost, and forget where features were that slide (`slam.models.SlideModel`). A landmark becomes a variable when
+        its smart factor is full: then it keeps what that says of it, as the measurements go over. Variables that were
+        not measured for longer than a factor spans make room, the oldest first.
 
         gtsam linearises a variable no more once a pose that measured it has left the lag. At an offset δ from there and
         a distance d a pixel is wrong by f (δ/d)²: less than its noise σ where d > δ `ratio`, with ``ratio² = f/σ``.
         So a landmark becomes a variable where that holds for its deviation, and goes on in a smart factor where it
         holds no more for its offset. Else landmarks that are known from afar carry the path away as it passes them.
         """
+        if len(rows) > most:
+            return self
         variable, since = self.variable.copy(), self.since.copy()
         deviation = np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2))
         offset = np.linalg.norm(self.position[rows] - self.linearised[rows], axis=1)
@@ -120,7 +123,7 @@ class SmootherLandmarks(LandmarkRows):
         nonlinear = apart >= np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
         full = ~variable[rows] & (since[rows] <= tick - track) & (last[rows] >= tick - max(track // 2, 1))
         new = rows[full & ~nonlinear & np.isfinite(z[:, 2])]
-        leaving = np.flatnonzero(variable & (last < tick - max(track // 2, 1)))
+        leaving = np.flatnonzero(variable & (last < tick - track))
         leaving = leaving[np.argsort(last[leaving], kind="stable")][: max(int(variable.sum()) + len(new) - most, 0)]
         new = np.sort(new)[: most - int(variable.sum()) + len(leaving)]
         leaving = np.append(leaving, rows[variable[rows] & nonlinear])

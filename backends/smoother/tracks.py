@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import gtsam
-import numpy as np
 from gtsam.symbol_shorthand import L, X
 
 from backends.smoother.factors import FactorMaker, GraphUpdate, SmartFactor
@@ -120,18 +119,13 @@ class Tracks:
         self._grown = {}
         return made
 
-    def contradicted(self, s: SmootherState, values: gtsam.Values) -> bool:
+    def contradicted(self) -> bool:
         """Whether the measurements of a near landmark put it behind a camera: then poses are wrong.
 
         Noise alone may put a far one there. gtsam takes both for no information: so a path of a thousand frames of real
-        tracks ran away. Of landmarks that are variables the newest pose is asked.
+        tracks ran away.
         """
-        if any(t.factor is not None and not t.far and not t.factor.isValid() for t in self._smart.values()):
-            return True
-        sight, T = s.sights[s.of(s.number)], values.atPose3(X(s.number)).matrix()
-        near = sight.serials[sight.z[:, 0] - sight.z[:, 2] >= self._make.far].tolist()
-        points = [values.atPoint3(L(serial)) for serial in near if self._variables.get(serial) == s.number]
-        return bool(((np.array(points).reshape(-1, 3) - T[:3, 3]) @ T[:3, 2] <= 0).any())
+        return any(t.factor is not None and not t.far and not t.factor.isValid() for t in self._smart.values())
 
     def forget(self, s: SmootherState, oldest: int) -> None:
         """Forget what has left with the poses before the `oldest`: no slot is named after its factor has left."""

@@ -13,6 +13,7 @@ from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker, to_pose3
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
+from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels, MotionModel
 from slam.window import motion
 from slam.window.stereo import RectifiedStereo
@@ -20,6 +21,7 @@ from tests.backends.scenes import RIG, forget, nees, observe, path, run, scene, 
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
 DT = 0.1
+KITTI = StereoRig.rectified_pair(707.0912, 601.8873, 183.1104, 0.53715065, 1226, 370)
 
 
 def drive(frames: int, **options):
@@ -63,7 +65,6 @@ def test_the_path_and_its_covariance_with_all_options(options):
     assert (len(backend.state.sights) < 9) == ("past" in options), "what is kept does not grow for ever"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seen_at_once", "seed", "most"),
     [(100, 0, 0.3), (15, 0, 1.5), (8, 2, 2.5)],
@@ -176,13 +177,13 @@ def test_a_place_in_the_world_that_is_hardly_known_does_not_move():
 
 def test_what_is_known_of_a_landmark_outlasts_the_poses_that_measured_it():
     """It was found anew from the measurements of those poses alone that were kept: .09 m and .40 m off for .03 m."""
-    backend, known = SmootherBackend(RIG, MODELS, past=10, landmarks=0), set()  # variables move for longer
+    backend, known = SmootherBackend(RIG, MODELS, past=10), set()
     seen_last: dict[int, tuple[int, np.ndarray, np.ndarray]] = {}
     for k, (stamp, _, seen) in enumerate(drive(90, points=500)):
         step(backend, stamp, seen, known)
         marks = backend.state.landmarks
         for i, last, position, own in zip(marks.ids.tolist(), marks.pose.max(axis=1), marks.position, marks.own):
-            if last == k - 13:  # by now it stands still: its poses have left the lag
+            if last == k - 17:  # by now it stands still: its poses have left the lag
                 seen_last[i] = last, position, own
     old = [i for i, (last, *_) in seen_last.items() if last == marks.pose.max(axis=1)[marks.rows_of([i])[0]]]
     assert len(old) > 15 and backend.state.first > 40
@@ -192,13 +193,11 @@ def test_what_is_known_of_a_landmark_outlasts_the_poses_that_measured_it():
     assert np.linalg.eigvalsh(backend.estimate().covariances).min() > 0, "also where no pose is kept any more"
 
 
-@pytest.mark.parametrize("landmarks", [0, 40])
-def test_landmarks_behind_the_camera_are_as_uncertain_as_when_they_were_seen_last(landmarks):
+def test_landmarks_behind_the_camera_are_as_uncertain_as_when_they_were_seen_last():
     """Their measurements were taken for some of a later pose, which sees nothing behind it: a median NEES of 70."""
-    poses, known = path(90, DT, np.array([0.0, 0.0, 4.0]), np.zeros(3)), set()
+    poses, known = path(100, DT, np.array([0.0, 0.0, 4.0]), np.zeros(3)), set()
     models = EstimatorModels(MotionModel(1.0, 0.3), 0.7, initial_velocity_sigma=15.0)
-    backend = SmootherBackend(RIG, models, landmarks=landmarks)
-    data, then = scene(poses, points=1000, limit=40, sigma=0.7), {}
+    backend, data, then = SmootherBackend(RIG, models), scene(poses, points=1000, limit=40, sigma=0.7), {}
     for stamp, _, seen in data:
         step(backend, stamp, seen, known)
         found = backend.estimate()
@@ -274,7 +273,6 @@ def test_the_map_is_where_it_was_after_a_hundred_frames_in_the_dark():
     assert backend.trajectory().stamps.tolist() == data.stamps.tolist()
 
 
-@pytest.mark.slow
 def test_landmarks_that_return_after_a_lap_are_measured_again_without_a_lag():
     """What the camera had drifted since did not count: 16 good measurements were refused."""
     models, refused = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=1.0), 0
@@ -317,7 +315,7 @@ def test_right_pixels_are_mended_afterwards(options):
         return se3.inverse(poses[0]) @ poses
 
     off = [errors(shape(backend), data.poses)[0].max() for backend in (right, mended, spoilt)]
-    assert off[1] < off[0] + 0.007 < off[2], off  # poses that had left the lag keep their places to each other
+    assert off[1] < off[0] + 0.005 < off[2], off
     ours, theirs = mended.estimate(), right.estimate()
     np.testing.assert_array_equal(ours.ids, theirs.ids)
     local, truth = (se3.transform(se3.inverse(e.T_world_left), e.positions) for e in (ours, theirs))
@@ -326,14 +324,10 @@ def test_right_pixels_are_mended_afterwards(options):
     assert np.median((np.linalg.norm(local - truth, axis=1) / deviations)[seen]) < 0.6  # of its own uncertainty
 
 
-@pytest.mark.parametrize("landmarks", [0, 40])
-def test_a_revision_that_changes_nothing_leaves_the_covariances(landmarks):
-    """Up to what poses that have left the lag told of it: the graph is built anew from the poses of the lag alone.
-
-    Not where landmarks are variables: theirs were up to 2.5 times as large afterwards.
-    """
+def test_a_revision_that_changes_nothing_leaves_the_covariances():
+    """Up to what poses that have left the lag told of it: the graph is built anew from the poses of the lag alone."""
     data = drive(30, points=250)
-    backend = tracked(data, landmarks=landmarks)
+    backend = tracked(data)
     before = backend.estimate()
     backend.revise(lambda z: z)
     after = backend.estimate()

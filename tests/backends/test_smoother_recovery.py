@@ -26,9 +26,9 @@ def drive(frames: int = 22):
 
 
 @cache
-def untouched(**options: int) -> SmootherBackend:
+def untouched() -> SmootherBackend:
     """After the drive, in which nothing fails."""
-    backend = SmootherBackend(RIG, MODELS, **options)
+    backend = SmootherBackend(RIG, MODELS)
     run(backend, drive())
     return backend
 
@@ -71,21 +71,18 @@ def break_solver(monkeypatch):
 
 @pytest.mark.parametrize("method", ["update", "calculateEstimate", "getISAM2"])
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
-@pytest.mark.parametrize("landmarks", [0, 40])
-def test_one_failure_costs_nothing(break_solver, method, error, landmarks):
-    """But what landmarks that are variables had told beyond their smart factors."""
-    data, plain = drive(), untouched(landmarks=landmarks)
+def test_one_failure_costs_nothing(break_solver, method, error):
+    data, plain = drive(), untouched()
     break_solver(method, [11], error)
-    backend = SmootherBackend(RIG, MODELS, landmarks=landmarks)
+    backend = SmootherBackend(RIG, MODELS)
     reports = run(backend, data)
     assert all(r.status is UpdateStatus.OK for r in reports[1:]), "the measurements were used after the rebuild"
     said = [r.reason for r in reports[1:] if r.reason]
     assert len(said) == 1 and said[0].startswith("smoother: built anew after gtsam: ") and "\n" not in said[0]
     off = se3.log(se3.inverse(plain.trajectory().poses) @ backend.trajectory().poses)
     deviations = np.sqrt(np.diag(plain.estimate(landmarks=False).covariance))
-    assert np.abs(off / deviations).max() < (
-        1.5 if landmarks else 0.05
-    )  # linearised anew, where poses are known better
+    assert np.abs(off / deviations).max() < 0.5  # all is linearised anew, where poses are known better
+    assert np.abs(off).max() < 2e-3  # [rad, m]; measured: 1.06e-3 in the worst case
     off = se3.log(se3.inverse(data.poses) @ backend.trajectory().poses)
     assert np.abs(off[:, 3:]).max() < 0.05 and np.abs(off[:, :3]).max() < 0.01
     assert np.linalg.eigvalsh(backend.estimate().covariance).min() > 0
@@ -100,14 +97,13 @@ def test_errors_of_our_own_are_not_taken_for_gtsams(monkeypatch):
         run(SmootherBackend(RIG, MODELS), drive(5))
 
 
-@pytest.mark.parametrize(("landmarks", "ahead"), [(0, 3.0), (40, 4.0)])
-def test_a_near_landmark_behind_a_camera_has_the_graph_built_anew(monkeypatch, landmarks, ahead):
-    """gtsam takes it for no information; of a near one it says that poses are wrong. Of variables it was not asked."""
-    data, backend, known = list(drive(12)), SmootherBackend(RIG, MODELS, landmarks=landmarks), set()
+def test_a_near_landmark_behind_a_camera_has_the_graph_built_anew(monkeypatch):
+    """gtsam takes it for no information; of a near one it says that poses are wrong."""
+    data, backend, known = list(drive(12)), SmootherBackend(RIG, MODELS), set()
     for stamp, _, seen in data[:-1]:
         step(backend, stamp, seen, known)
-    solve, off = pose_only.solve, se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, ahead]))
-    monkeypatch.setattr(pose_only, "solve", lambda *arguments: (solve(*arguments)[0] @ off, solve(*arguments)[1]))
+    solve, ahead = pose_only.solve, se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 3.0]))
+    monkeypatch.setattr(pose_only, "solve", lambda *arguments: (solve(*arguments)[0] @ ahead, solve(*arguments)[1]))
     reason = step(backend, *data[-1][::2], known).reason
     assert reason == "smoother: built anew after a near landmark lies behind a camera that measured it"
 
