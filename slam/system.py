@@ -278,8 +278,8 @@ class StereoSlam:
                 return out(result)
             state = located
         repeated = len(features) > 0 and checksum is not None and checksum == state.checksum
-        masked = state.standing.without_fastened(self.config.models.pixel_sigma, features)
-        features = _nothing_of(features) if repeated else masked
+        sigma, standing = self.config.models.pixel_sigma, state.standing
+        features = _nothing_of(features) if repeated else standing.without_fastened(sigma, features)
         with self._stages.stage("predict"):
             revision = tracker.revise(state)
         done = self._step(state, features, repeated)

@@ -182,7 +182,7 @@ class Standing:
 def _most_stay(places: Places, seen: StereoFeatures, rows: NDArray[np.intp]) -> bool:
     """Whether most of what is found again stays, as `rows` (M,) of the features do.
 
-    What is found nowhere says nothing: leaves and shadows are other features in each one.
+    What is found nowhere says nothing: leaves and shadows are other features in each frame.
     """
     last = places.select(places.missed == 0)
     every = min(len(seen), len(last))
