@@ -133,7 +133,7 @@ class Tracker:
         change = self.calibration.apply(SIGNIFICANT if isinstance(state.backend, RevisingBackend) else 0.0)
         if change is not None and state.tracks is not None:
             self.objects.revise(state.tracks, change.rows)
-        return self.rig_error.revise(state.backend, restarted=bool(state.past))
+        return self.rig_error.revise(state.backend, restarted=bool(state.restarted))
 
     def predict(self, state: State, features: StereoFeatures) -> tuple[Standing, Prediction]:
         """Whether the camera stands, and the back end's prediction for the time of the features."""
