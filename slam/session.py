@@ -32,8 +32,9 @@ from slam.geometry.se3 import Array
 from slam.interfaces import Backend, MapBackend
 from slam.tracker import Elsewhere, State, Tracker
 from slam.tracks.localizer import Search, nowhere
+from slam.tracks.mapper import depth_is_known
 from slam.tracks.standing import Standing
-from slam.tracks.step import Step
+from slam.tracks.step import Step, TrackingState
 from slam.tracks.table import Tracks
 
 #: Standard deviations of the initial pose [m], [rad] of a back end that starts in a map. They are wide, because the
@@ -91,7 +92,7 @@ class Session:
             T = place.T_odom_left
         self._tracker.mapper.next_id = saved.next_id
         new, tracks = self._start(state.tracks, T, (saved.ids, saved.positions, saved.covariances), place)
-        return replace(state, backend=new, tracks=tracks, prior_map=None, online=())
+        return replace(state, backend=new, tracks=tracks, prior_map=None, online=(), ever_mapped=True)
 
     def not_found(self, state: State, features: StereoFeatures) -> tuple[State, FrameResult]:
         """State and result after a frame in which the camera was not found in the prior map."""
@@ -110,6 +111,21 @@ class Session:
         k, none = state.prior_map, nowhere(stamp, self._config.models.initial_pose)
         assert k is not None
         return Estimate(stamp, none.T_world_left, none.covariance, k.ids, k.positions, k.covariances)
+
+    def at_first_sight(self, state: State, features: StereoFeatures) -> State:
+        """The state with a new back end where the first landmarks can begin after frames that showed none.
+
+        They define the world's coordinates, so the pose in this frame is exact, as in a first one: with that of a back
+        end that has predicted it since then, linearisation would fail, see `taken_over`.
+        """
+        c, rows = self._config, np.flatnonzero(features.has_stereo)
+        if state.ever_mapped or state.index < 0 or self._backend is None:
+            return state
+        if not depth_is_known(self._tracker.rig, features, rows, c.models.pixel_sigma, c.map.max_depth_error).any():
+            return state
+        self._tracker.objects.restart()
+        past, new = (*state.past, state.backend.trajectory()), self._new(CommonError())
+        return replace(state, backend=new, tracks=None, tracking=TrackingState(), online=(), past=past)
 
     def taken_over(self, state: State, elsewhere: Elsewhere, features: StereoFeatures) -> tuple[State, Prediction]:
         """The state with another back end, and what that predicts for the frame in which it takes over.

@@ -280,6 +280,7 @@ class StereoSlam:
         repeated = len(features) > 0 and checksum is not None and checksum == state.checksum
         sigma, standing = self.config.models.pixel_sigma, state.standing
         features = _nothing_of(features) if repeated else standing.without_fastened(sigma, features)
+        state = session.at_first_sight(state, features)
         with self._stages.stage("predict"):
             revision = tracker.revise(state)
         done = self._step(state, features, repeated)

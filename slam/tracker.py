@@ -62,7 +62,7 @@ class State:
     tracking: TrackingState = field(default_factory=TrackingState)  # how localization has gone
     standing: Standing = field(default_factory=Standing)  # whether the camera stands
     dimensions: int | None = None  # length of the descriptors; None before the first feature
-    ever_mapped: bool = False  # whether there ever was a landmark
+    ever_mapped: bool = False  # whether there ever were landmarks enough to measure a pose
     measured_at: float = -np.inf  # time of the last frame whose pose was measured, or in which a new map began [s]
     checksum: tuple[int, int] | None = None  # of the images; None without images, or of images that show nothing
     # in which the camera has not been found yet; None without one, or once it is found
@@ -82,7 +82,7 @@ class State:
         return changed(
             self, tracks=step.tracks, atlas=atlas, index=step.index, tracking=step.tracking, online=step.online,
             standing=changed(step.standing, T_world_left=seen_at),
-            checksum=checksum, ever_mapped=self.ever_mapped or len(step.added) > 0,
+            checksum=checksum, ever_mapped=self.ever_mapped or len(step.tracks.mapped) >= MINIMAL_POINTS,
             dimensions=step.features.descriptors.shape[1] if len(step.features) else self.dimensions,
             measured_at=step.features.stamp if located else self.measured_at,
         )  # fmt: skip
@@ -133,7 +133,7 @@ class Tracker:
         change = self.calibration.apply(SIGNIFICANT if isinstance(state.backend, RevisingBackend) else 0.0)
         if change is not None and state.tracks is not None:
             self.objects.revise(state.tracks, change.rows)
-        return self.rig_error.revise(state.backend, restarted=bool(state.past))
+        return self.rig_error.revise(state.backend, restarted=bool(state.restarted))
 
     def predict(self, state: State, features: StereoFeatures) -> tuple[Standing, Prediction]:
         """Whether the camera stands, and the back end's prediction for the time of the features."""

@@ -128,7 +128,7 @@ def _slip(true: Trajectory, noise: TruthNoise) -> tuple[Array, Array]:
 
 
 def interpolated(true: Trajectory, noise: TruthNoise) -> BoolArray:
-    """Which poses (N,) of a moving vehicle or camera were not measured: the steps to and from them turn by the same.
+    """Which poses (N,) of a moving vehicle or camera were not measured: it turns at the same rate before and after.
 
     Without motion, by less than the noise of the truth, equal turns are no sign of it. What was measured turns by this
     noise at least, so that a path of which every pose was interpolated is known without one that was not.
@@ -137,7 +137,9 @@ def interpolated(true: Trajectory, noise: TruthNoise) -> BoolArray:
     if len(true) < 3 or not noise.covariance.any():
         return made_up
     motion = inverse(true.poses[:-1]) @ true.poses[1:]
-    change = np.linalg.norm(np.diff(so3_log(motion[:, :3, :3]), axis=0), axis=1)
+    steps = np.diff(true.stamps)
+    turns = so3_log(motion[:, :3, :3]) * (np.median(steps) / steps)[:, None]  # as if no frame were missing
+    change = np.linalg.norm(np.diff(turns, axis=0), axis=1)
     moves = np.linalg.norm(motion[:, :3, 3], axis=1) > noise.translation
     large = float(np.quantile(change, _LARGE))
     if large < _LEAST:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from slam.geometry.se3 import Array
 
 _ALTERNATES = 1.1  # guard: difference of neighbours in units of that of the next but one; noise alone gives 1
-_SMOOTHER = 0.5  # guard: share of the roughness that is left where bytes are put right
+_SMOOTHER = 0.5  # guard: roughness of the lower byte of each pixel in units of the upper one's, which is smoother
 
 
 def grain_doubt(image: object) -> str:
@@ -18,7 +18,7 @@ def grain_doubt(image: object) -> str:
     if min(image.shape) < 1 or min(image.shape[:2]) < 3:
         return ""
     grey = image if image.ndim == 2 else image[:, :, 0]
-    if grey.dtype == np.uint16 and _roughness(grey.byteswap()) < _SMOOTHER * _roughness(grey):
+    if grey.dtype == np.uint16 and 0 < _roughness(grey & 255) < _SMOOTHER * _roughness(grey >> 8):
         return (
             "the two bytes of each pixel look exchanged: 16-bit images of the other byte order; write them again with "
             "image.byteswap()"

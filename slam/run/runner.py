@@ -187,6 +187,8 @@ class _Run:
                     if score is not None:
                         score.add(number, result, labels_in_images(self.sequence, number, result.features))
                     if options.record is not None:
+                        if len(record.seen) == len(result.added):  # another back end has begun with them
+                            self.tape.clear()
                         self.tape.append(RecordedFrame.of(result, number))
                     if on_frame is not None:
                         on_frame(result)

@@ -52,6 +52,8 @@ def test_interpolated_truth_is_noticed_where_it_is():
     assert found[10:19].all() and found[20:29].all()  # they end or begin at poses that were not measured
     assert not found[:10].any() and not found[19] and not found[29:].any()
     assert np.flatnonzero(interpolated(true, NOISE)).tolist() == [*range(20, 29)]
+    kept = np.setdiff1d(np.arange(100), [5, 22, 24, 25, 60, 61])  # a camera lost the others
+    assert kept[interpolated(true.select(kept), NOISE)].tolist() == [20, 21, 23, 26, 27, 28]
     standing = Trajectory(true.stamps, np.concatenate([np.tile(np.eye(4), (50, 1, 1)), drive(50).poses]))
     for even in (standing, straight(400)):  # equal turns by nothing are none that was made up
         assert not interpolated(even, NOISE).any()

@@ -71,6 +71,12 @@ def noise(left, right):
     return tuple(rng.integers(0, 255, (240, 320), dtype=np.uint8) for _ in range(2))
 
 
+def dim(left, right):
+    """Noisy, and across a multiple of 256."""
+    grain = np.random.default_rng(0).integers(0, 6, left.shape, np.uint16)
+    return tuple(x.astype(np.uint16) // 16 + 1020 + grain for x in (left, right))
+
+
 def never_rectified(left, right):
     H = RIG.left.K @ cv2.Rodrigues(np.array([0.03, 0.0, -0.02]))[0] @ np.linalg.inv(RIG.left.K)
     return left, cv2.warpPerspective(right, H, (320, 240))
@@ -201,6 +207,7 @@ SAID = {
     "bytes exchanged": (
         every(3, lambda a, b: tuple((x.astype(np.uint16) * 16).byteswap() for x in (a, b))), {}, "two bytes of each"
     ),
+    "a few grey values of 16 bits": (every(3, dim), {}, ""),
     "12 of 16 bits": (every(3, lambda a, b: (a.astype(np.uint16) * 16, b.astype(np.uint16) * 16)), {}, ""),
     "mosaic": (every(3, mosaic), {}, "mosaic of a colour camera"),
     "interlaced": (
