@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from operator import attrgetter
 
 import numpy as np
 
@@ -193,7 +194,7 @@ class MovingObjectDetector(ObjectDetector):
     ) -> tuple[Frame, StereoFeatures]:
         """The frame and its measured features, those of bodies' members aligned with earlier images."""
         now = measured
-        for body in self.bodies.values():
+        for body in filter(attrgetter("proven"), self.bodies.values()):
             mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
             T = inverse(body.T) @ frame.T_world_left
             now = aligner.align(now, tracks.row[mine], tracks, mine, T, tracks.local[mine], body.id)
@@ -206,7 +207,7 @@ class MovingObjectDetector(ObjectDetector):
     def _take_patches(self, tracks: Tracks, frame: Frame, measured: StereoFeatures, aligner: Aligner) -> None:
         """Members of measured bodies that have no image patch yet get one."""
         for body in self.bodies.values():
-            if body.belief is not None and body.belief.estimate.measured:
+            if body.proven and body.belief is not None and body.belief.estimate.measured:
                 used = isin(tracks.number, body.belief.estimate.used)
                 mine = np.flatnonzero((tracks.body == body.id) & tracks.found & used)
                 T = inverse(body.T) @ frame.T_world_left

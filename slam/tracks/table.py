@@ -65,9 +65,7 @@ class LandmarkTable(Table):
     unseen: IdArray = _column(np.int64)
     # of those long out of view: frames up to the last in which it was found, in succession, without counting (N,)
     returning: IdArray = _column(np.int64)
-    patches: NDArray[np.object_] = _column(
-        object, fill=None
-    )  # at first sight (N,), or None; see `Patch`
+    patches: NDArray[np.object_] = _column(object, fill=None)  # `Patch` at first sight (N,), or None
 
     def __post_init__(self) -> None:
         for name, column in list(vars(self).items()):
