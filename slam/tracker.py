@@ -181,12 +181,10 @@ class Tracker:
             matches = LandmarkMatches.nothing()
         tracks.count_returning(matches.returning)
         aligned, T = features, matches.T_world_left
-        if self._aligner is not None:
-            tracks.patches[(tracks.ids >= 0) & (tracks.unseen > 10)] = None  # [frames]
-            if T is not None:  # else they do not agree
-                where, at = positions[landmarks.rows(matches.ids)], tracks.rows(matches.ids)
-                aligned = self._aligner.align(features, matches.rows, tracks, at, T, where)
-                corrected = shifted_as(corrected, features, aligned)
+        if self._aligner is not None and T is not None:  # else they do not agree
+            where, at = positions[landmarks.rows(matches.ids)], tracks.rows(matches.ids)
+            aligned = self._aligner.align(features, matches.rows, tracks, at, T, where)
+            corrected = shifted_as(corrected, features, aligned)
         step = Step(index, aligned, changed(corrected, images=None), prediction, tracks, matches, standing, tracking)
         suspects = self._suspects(step)
         matches = matches.select(~isin(matches.ids, suspects))

@@ -40,9 +40,11 @@ class Aligner:
         """The features, with those in `rows` (K,) moved to where the patches of points are found that they show.
 
         The points are `at` (K,) in the table, at `positions` (K, 3) [m] in the world, or in a body; there the camera
-        is at `T_left` (4, 4). Those without a patch are unchanged; patches that are to be taken anew are dropped, in
-        place. Raises SlamError where the front end does not return pixels.
+        is at `T_left` (4, 4). Those without a patch are unchanged; patches that are to be taken anew, and those of
+        landmarks not seen for long, are dropped, in place. Raises SlamError where the front end does not return pixels.
         """
+        if body == STILL:
+            table.patches[at[table.unseen[at] > 10]] = None  # [frames]
         usable = table.has_patch(at, body)
         if features.images is None or not usable.any():
             return features
