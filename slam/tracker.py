@@ -41,7 +41,7 @@ from slam.input.warnings import REPEATED
 from slam.interfaces import AligningFrontend, Backend, Frontend, MapBackend, RestingBackend, RevisingBackend
 from slam.object_data import MovingObject
 from slam.third_party import OnlinePose, checked, recent_of
-from slam.tracks.alignment import align, take_patches
+from slam.tracks.alignment import Aligner, shifted_as
 from slam.tracks.localizer import Localizer, Search, jump, median_deviation
 from slam.tracks.mapper import Mapper
 from slam.tracks.standing import Standing
@@ -121,8 +121,9 @@ class Tracker:
         self.loop_closer = LoopCloser(rig, c.atlas.enabled, c.association, c.models, c.map.max_depth_error)
         self._can_restart = restarts and isinstance(backend, MapBackend)
         self.advanced = -np.inf  # stamp to which a back end was last advanced [s]; an interrupted step counts
-        aligns = c.association.align and isinstance(frontend, AligningFrontend)
-        self._aligning: AligningFrontend | None = frontend if aligns else None  # type: ignore[assignment]
+        self._aligner: Aligner | None = None
+        if c.association.align and isinstance(frontend, AligningFrontend):
+            self._aligner = Aligner(rig, frontend)
 
     def find(self, state: State, features: StereoFeatures) -> Found | None:
         """The camera's pose by the keyframes of the atlas."""
@@ -179,11 +180,11 @@ class Tracker:
                 return Elsewhere(matches.T_world_left, place)
             matches = LandmarkMatches.nothing()
         tracks.count_returning(matches.returning)
-        aligned = features
-        if self._aligning is not None:
-            aligned = align(self.rig, self._aligning, features, matches, tracks, backend.positions)
-        if aligned is not features:
-            corrected = _shifted_as(corrected, features, aligned)
+        aligned, T = features, matches.T_world_left
+        if self._aligner is not None and T is not None:  # else they do not agree
+            where, at = positions[landmarks.rows(matches.ids)], tracks.rows(matches.ids)
+            aligned = self._aligner.align(features, matches.rows, tracks, at, T, where)
+            corrected = shifted_as(corrected, features, aligned)
         step = Step(index, aligned, changed(corrected, images=None), prediction, tracks, matches, standing, tracking)
         suspects = self._suspects(step)
         matches = matches.select(~isin(matches.ids, suspects))
@@ -243,7 +244,9 @@ class Tracker:
     def classify(self, state: State, step: Step) -> Step:
         """Which features move, and the moving bodies."""
         features, standing = step.features, step.standing
-        labels, objects = self.objects.step(step.recent, step.tracks, features, step.estimate, standing.witnesses)
+        labels, objects = self.objects.step(
+            step.recent, step.tracks, features, step.estimate, standing.witnesses, step.measured, self._aligner
+        )
         if standing.stands:  # a feature that does not stay is undecided, unless it moves
             leaving = np.setdiff1d(np.arange(len(features)), standing.witnesses)
             undecided = np.setdiff1d(np.union1d(labels.undecided, leaving), labels.moving)
@@ -253,9 +256,10 @@ class Tracker:
     def manage(self, state: State, step: Step) -> Step:
         """Change the map, and remember the image patches of new landmarks."""
         step = self.mapper.update(state.backend, step)
-        if self._aligning is not None:
+        if self._aligner is not None:
             seen, T = step.matches.joined(step.added), step.estimate.T_world_left
-            take_patches(self._aligning, step.measured, seen, step.tracks, T)
+            seen = seen.select(isin(seen.ids, step.tracks.ids))
+            self._aligner.take_patches(step.measured, seen.rows, step.tracks, step.tracks.rows(seen.ids), T)
         return step
 
     def close_loops(self, state: State, step: Step) -> tuple[Step, Atlas]:
@@ -274,14 +278,6 @@ class Tracker:
         if state.prior_map is not None or not np.isfinite(self.advanced):  # that back end has not begun
             return state
         return replace(state, tracks=self.mapper.reconcile(state.backend, state.tracks))
-
-
-def _shifted_as(corrected: StereoFeatures, before: StereoFeatures, now: StereoFeatures) -> StereoFeatures:
-    """Corrected features that move as the measured ones did: the correction is the same over so small a shift."""
-    if corrected is before:
-        return now
-    left, right = now.uv_left - before.uv_left, now.uv_right - before.uv_right
-    return changed(corrected, uv_left=corrected.uv_left + left, uv_right=corrected.uv_right + right)
 
 
 def frame_result(

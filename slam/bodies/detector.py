@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from operator import attrgetter
 
 import numpy as np
 
@@ -29,12 +30,13 @@ from slam.bodies.membership import merge
 from slam.bodies.proof import Way, with_frame
 from slam.bodies.regions import Region, follow_regions
 from slam.data import BoolArray, Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
-from slam.geometry.arrays import among, changed, median
+from slam.geometry.arrays import among, changed, isin, median
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, transform
+from slam.geometry.se3 import Array, inverse, transform
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
 from slam.third_party import OnlinePose, derived_recent
+from slam.tracks.alignment import Aligner, shifted_as
 from slam.tracks.table import Tracks
 
 _FORGOTTEN = 8.0  # [s] after which an unseen body is forgotten
@@ -68,13 +70,14 @@ class ObjectDetector:
 
     def step(
         self, recent: RecentPoses | None, tracks: Tracks, features: StereoFeatures, estimate: Estimate,
-        still: IndexArray,
+        still: IndexArray, measured: StereoFeatures, aligner: Aligner | None,
     ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
         """Say which features move, before any of them becomes a landmark, and report the bodies.
 
         The table changes in place; landmarks that were found have their feature already. `estimate` is that after the
-        update, `recent` the last poses if the back end knows how their errors hang together, and `still` are rows of
-        features that stay at their pixels while the camera stands.
+        update, `recent` the last poses if the back end knows how their errors hang together, `still` are rows of
+        features that stay at their pixels while the camera stands, and `measured` the features before the calibration
+        corrected them, which the `aligner` moves.
         """
         none = np.zeros(0, np.intp)
         return MotionLabels(none, none, np.zeros(0, np.int64)), ()
@@ -122,12 +125,14 @@ class MovingObjectDetector(ObjectDetector):
 
     def step(
         self, recent: RecentPoses | None, tracks: Tracks, features: StereoFeatures, estimate: Estimate,
-        still: IndexArray = NO_IDS,
+        still: IndexArray = NO_IDS, measured: StereoFeatures | None = None, aligner: Aligner | None = None,
     ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
         """Follow all tracks into this frame, test them, and find bodies; see `ObjectDetector`."""
         frame = self._begin(recent, tracks, features, estimate)
         self._advance_bodies(tracks, frame)
         follow(tracks, self.bodies, frame)
+        if measured is not None and aligner is not None:
+            frame, measured = self._aligned(tracks, frame, measured, aligner)
         self._measure(tracks, frame)
         np.maximum(tracks.parted - 1, 0, out=tracks.parted)
         tracks.still[:] = tracks.found & among(max(len(frame.local), 1), still)[tracks.row]
@@ -152,6 +157,8 @@ class MovingObjectDetector(ObjectDetector):
         suspected = np.concatenate([tracks.ids[suspects], tracks.ids[unproven]])
         self.suspects = np.unique(suspected[suspected >= 0])
         self._begin_estimates(tracks, frame)
+        if measured is not None and aligner is not None:
+            self._take_patches(tracks, frame, measured, aligner)
         self._begin_tracks(tracks, frame)
         return self._motion_labels(tracks, frame, proven), reported(self.bodies, tracks, frame.slot)
 
@@ -181,6 +188,30 @@ class MovingObjectDetector(ObjectDetector):
                 tracks.give_up(np.flatnonzero(tracks.body == body.id))
             else:
                 self.bodies[body.id] = advanced(body, dt, frame.slot, self.setup.models)
+
+    def _aligned(
+        self, tracks: Tracks, frame: Frame, measured: StereoFeatures, aligner: Aligner
+    ) -> tuple[Frame, StereoFeatures]:
+        """The frame and its measured features, those of bodies' members aligned with earlier images."""
+        now = measured
+        for body in filter(attrgetter("proven"), self.bodies.values()):
+            mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
+            T = inverse(body.T) @ frame.T_world_left
+            now = aligner.align(now, tracks.row[mine], tracks, mine, T, tracks.local[mine], body.id)
+        if now is measured:
+            return frame, measured
+        features = shifted_as(frame.features, measured, now)
+        local = frame.setup.rig.triangulate(features.uv_left, features.uv_right)
+        return changed(frame, features=features, local=local), now
+
+    def _take_patches(self, tracks: Tracks, frame: Frame, measured: StereoFeatures, aligner: Aligner) -> None:
+        """Members of measured bodies that have no image patch yet get one."""
+        for body in self.bodies.values():
+            if body.proven and body.belief is not None and body.belief.estimate.measured:
+                used = isin(tracks.number, body.belief.estimate.used)
+                mine = np.flatnonzero((tracks.body == body.id) & tracks.found & used)
+                T = inverse(body.T) @ frame.T_world_left
+                aligner.take_patches(measured, tracks.row[mine], tracks, mine, T, body.id)
 
     def _measure(self, tracks: Tracks, frame: Frame) -> None:
         """Estimate the bodies, and add this frame's measurements to the tracks, in world coordinates."""

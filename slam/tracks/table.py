@@ -21,6 +21,7 @@ from slam.geometry.arrays import Table
 from slam.geometry.se3 import Array
 from slam.naming import count
 
+STILL = -1  #: in place of a body's id: the still world
 _ROOM = 1000  # cost: rows that a table begins with
 
 #: Columns of `Tracks` that say what waits for a depth; all but the first one mean nothing where nothing does.
@@ -29,12 +30,13 @@ _WAITING = ("waiting_since", "look", "first_pixel", "first_pose", "first_covaria
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """The image around a landmark, seen from a pose."""
+    """The image around a point, seen from a pose."""
 
     image: NDArray[np.float32]  # (S, S) float32
-    centre: Array  # coordinates of the landmark within it (2,)
+    centre: Array  # coordinates of the point within it (2,)
     size: float  # of the feature [px]
-    T_world_left: Array  # pose of the left camera (4, 4)
+    body: int  # id of the body that the point is part of, `STILL` of the world
+    T_left: Array  # pose of the left camera (4, 4) in that body, or in the world
 
 
 def _column(dtype: Any, *shape: int, fill: Any = 0) -> Any:
@@ -78,9 +80,9 @@ class LandmarkTable(Table):
         """Row numbers of ids that are in the map."""
         return np.searchsorted(self.ids, ids)
 
-    def has_patch(self, rows: IndexArray) -> BoolArray:
-        """Which of the rows (K,) have a patch."""
-        return np.array([patch is not None for patch in self.patches[rows]], bool)
+    def has_patch(self, rows: IndexArray, body: int = STILL) -> BoolArray:
+        """Which of the rows (K,) have a patch as part of a body, or of the world."""
+        return np.array([patch is not None and patch.body == body for patch in self.patches[rows]], bool)
 
     def long_out_of_view(self, after: int) -> BoolArray:
         """Which (N,) were outside of the image for `after` frames, or are of an earlier run."""
@@ -255,7 +257,7 @@ class Tracks(LandmarkTable):
 
     def erase_landmarks(self, rows: IndexArray) -> None:
         """Landmarks (K,) leave the map, in place; their tracks go on."""
-        self.ids[rows], self.patches[rows], self.parted[rows] = -1, None, 0
+        self.ids[rows], self.parted[rows] = -1, 0
         vars(self).pop("mapped", None)
 
     def begin(self, rows: IndexArray, numbers: IdArray, features: StereoFeatures, points: Array) -> None:
@@ -263,6 +265,7 @@ class Tracks(LandmarkTable):
         self.number[rows], self.unfound[rows], self.expelled[rows], self.parted[rows] = numbers, 0, False, 0
         self.anchor[rows] = self.position[rows] = points
         self.forget_past(rows)
+        self.patches[rows[self.ids[rows] < 0]] = None
         self.look[rows], self.laplacian[rows] = (x[self.row[rows]] for x in (features.descriptors, features.laplacian))
 
     def give_up(self, rows: IndexArray) -> None:
