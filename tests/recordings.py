@@ -1,7 +1,5 @@
 """Small sequences of every format, written into a folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -6,8 +6,6 @@ landmarks: five in view on average, none in a tenth of the steps, with the noise
 most is shared by the landmarks of a step.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Imports run one way, between packages and between the rooms of `slam`, in no circle; each brings what it needs."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

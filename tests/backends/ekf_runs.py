@@ -1,7 +1,5 @@
 """Runs of the EKF on simulated scenes, for its tests."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from backends.ekf import EkfBackend

@@ -1,7 +1,5 @@
 """A tiny deterministic scene for the tests of back ends: a rig, a path, points, and what the rig sees of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

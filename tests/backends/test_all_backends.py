@@ -1,7 +1,5 @@
 """What all back ends assume alike: poses, how unsure they are, rest, and walks without end."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import chi2

@@ -1,7 +1,5 @@
 """The contract suite over every registered back end, and over a third-party one that comes by an entry point."""
 
-from __future__ import annotations
-
 import pickle
 import sys
 from dataclasses import replace

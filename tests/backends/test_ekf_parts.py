@@ -1,7 +1,5 @@
 """The filter's arithmetic, each part against the plain dense formula or finite differences."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Landmarks whose place is known beforehand, in the world or before the camera, in every back end."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What the contract does not ask of the smoother: poses of the graph, the lag, gaps, mended measurements."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import gtsam

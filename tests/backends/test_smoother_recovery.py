@@ -1,7 +1,5 @@
 """The smoother goes on: after failures of gtsam, interrupted calls, and where the camera has lost its way."""
 
-from __future__ import annotations
-
 from functools import cache
 from itertools import count
 

@@ -1,7 +1,5 @@
 """Numerical derivatives, the rounding of matrices, and simple paths, for the tests."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from itertools import accumulate
 

@@ -1,7 +1,5 @@
 """Images that come again are no measurement: the pose is predicted, and frame and run say so."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

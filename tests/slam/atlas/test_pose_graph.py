@@ -1,7 +1,5 @@
 """The pose graph over the ends of loops gives what one over all keyframes gives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import gtsam

@@ -1,7 +1,5 @@
 """Which feature continues which track."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where a body is, by the few points that are seen of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The rig's uncertainty in poses and landmarks: its sensitivities against what a wrong rig really does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The time in which kernels are compiled is counted once, however compilations nest, and is in no other time."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

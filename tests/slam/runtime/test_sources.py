@@ -1,7 +1,5 @@
 """A kernel is compiled again where a helper in another file has changed, and loaded where nothing has."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import pkgutil

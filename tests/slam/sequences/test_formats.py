@@ -1,7 +1,5 @@
 """EuRoC's and KITTI's data sets, found out by themselves and read right; small sequences of known content."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

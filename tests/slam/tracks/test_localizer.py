@@ -1,7 +1,5 @@
 """A lost or carried camera is found again: by a place of the atlas, or by the map, where several frames agree."""
 
-from __future__ import annotations
-
 from itertools import groupby
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The window solver against dense least squares, finite differences, and itself with something marginalised."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
