@@ -11,7 +11,6 @@ from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker, to_pose3
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
-from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels, MotionModel
 from slam.window import motion
 from slam.window.stereo import RectifiedStereo
@@ -19,7 +18,6 @@ from tests.backends.scenes import RIG, forget, nees, observe, path, run, scene, 
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
 DT = 0.1
-KITTI = StereoRig.rectified_pair(707.0912, 601.8873, 183.1104, 0.53715065, 1226, 370)
 
 
 def drive(frames: int, **options):
