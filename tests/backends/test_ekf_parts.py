@@ -299,6 +299,16 @@ def test_a_coordinate_at_its_limit_has_changed_by_so_much():
     np.testing.assert_allclose(at.nu, expected, atol=1e-9)
 
 
+def test_a_distance_is_by_how_much_the_nis_falls_without_a_landmark():
+    _, update = far_off(1)
+    at, whole = update.linearised(update.camera), np.ones(12, bool)
+    every = at.solved(whole)
+    for gone in (0, 5, 11):
+        without = at.solved(np.arange(12) != gone)
+        assert every.nis - without.nis == pytest.approx(every.conditional_distances[gone], rel=1e-6)
+        assert without.conditional_distances[gone] == pytest.approx(every.conditional_distances[gone], rel=1e-6)
+
+
 def test_an_update_by_some_landmarks_depends_on_no_others():
     """Against the formulas of S, ν and H of the used ones alone."""
     _, update = far_off(1)
