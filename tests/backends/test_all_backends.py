@@ -5,7 +5,6 @@ import pytest
 from scipy.stats import chi2
 
 import backends
-from backends.smoother.landmarks import SmootherLandmarks
 from slam.data import Observations
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
@@ -129,19 +128,6 @@ def test_frames_so_far_apart_that_no_turn_is_predicted_hang_together(name):
             step(backend, 30 * stamp, seen, known)
         found.append(deviations(backend))
     assert (found[1] / found[0] > 0.98).all() and (found[1] / found[0] < 1.06).all(), found[1] / found[0]
-
-
-def test_drift_adds_up_while_a_landmark_is_not_seen():
-    none, certain = np.zeros((1, 3, 3)), 1e-4 * np.eye(3)[None]
-    marks = SmootherLandmarks.of(
-        np.array([0]), 0, np.array([[0.0, 0.0, 5.0]]), certain, none, False, np.zeros((1, 3, 0))
-    )
-    unseen, drift = np.zeros(0, np.intp), np.diag([1e-6, 2e-6, 3e-6, 1e-5, 2e-5, 3e-5])
-    once = marks.left_behind(unseen, np.eye(4), drift)
-    twice = once.left_behind(unseen, np.eye(4), drift)
-    assert np.trace(once.away[0]) > 1e-5
-    np.testing.assert_allclose(twice.away, 2 * once.away)
-    np.testing.assert_allclose(twice.from_newest, certain + twice.away)
 
 
 @pytest.mark.parametrize("name", ["ekf", "iekf", "smoother", "window"])
