@@ -87,9 +87,7 @@ def test_frames_that_see_nothing_at_uneven_times_leave_the_same_uncertainty(name
     data = scene(path(6, 0.1, np.array([0.05, 0.0, 0.3]), np.array([0.0, 0.05, 0.0])), 60, 0.05, limit=20)
     filtered, other = (backends.create(each, RIG, models=SURE) for each in ("ekf", name))
     for backend in (filtered, other):
-        known: set[int] = set()
-        for stamp, _, seen in data:
-            step(backend, stamp, seen, known)
+        run(backend, data)
         for stamp in (0.75, 0.85, 1.35):
             backend.predict(stamp)
             backend.update(data.observations[-1].select(np.zeros(0, int)))
@@ -123,9 +121,7 @@ def test_frames_so_far_apart_that_no_turn_is_predicted_hang_together(name):
     data, found = scene(path(12, 0.1, np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.1, 0.0])), 60, seed=3), []
     for each in ("batch", name):
         backend = backends.create(each, RIG, models=EstimatorModels(MotionModel(1.0, 1.0), pixel_sigma=0.5))
-        known: set[int] = set()
-        for stamp, _, seen in data:
-            step(backend, 30 * stamp, seen, known)
+        run(backend, zip(30 * data.stamps, data.poses, data.observations))
         found.append(deviations(backend))
     assert (found[1] / found[0] > 0.98).all() and (found[1] / found[0] < 1.06).all(), found[1] / found[0]
 

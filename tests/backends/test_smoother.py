@@ -99,9 +99,8 @@ def enter(backend, k: int, stamp: float, seen: Observations) -> None:
 @pytest.mark.parametrize(("options", "frames"), [({}, 1), ({}, 16), ({"lag": None}, 3), ({"lag": 4}, 4)], ids=str)
 def test_new_landmarks_in_a_frame_that_measured_nothing_leave_what_is_known(options, frames):
     """Until the next update the graph lacks its pose: all that is known of the poses before it went unheard."""
-    data, backend, known = list(drive(30, points=250)), SmootherBackend(RIG, MODELS, **options), set()
-    for stamp, _, seen in data[: 30 - frames]:
-        step(backend, stamp, seen, known)
+    data, backend = list(drive(30, points=250)), SmootherBackend(RIG, MODELS, **options)
+    run(backend, data[: 30 - frames])
     before, earlier = backend.estimate(), backend.recent(4)
     for k in range(30 - frames, 30):
         enter(backend, k, *data[k][::2])
@@ -132,8 +131,7 @@ def test_frames_that_measured_nothing_are_no_failure(lag, dark):
 @pytest.mark.parametrize("lag", [4, None])
 def test_a_long_rest_is_no_burden_and_its_map_is_still_known(lag):
     data, backend, known = list(drive(24, points=250)), SmootherBackend(RIG, MODELS, lag=lag), set()
-    for stamp, _, seen in data[:20]:
-        step(backend, stamp, seen, known)
+    run(backend, data[:20], known)
     last, before = data[19], sigma(backend)
     for k in range(1, 351):
         backend.predict_at_rest(last[0] + DT * k)
