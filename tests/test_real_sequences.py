@@ -3,6 +3,8 @@
 Bars are `bars.ROOM` times the medians over perturbations in ``tests/bars.json``, which `experiments/bars.py` writes.
 """
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 

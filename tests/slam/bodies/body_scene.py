@@ -1,5 +1,7 @@
 """Simulated rigid bodies before a moving camera, for the tests of their estimator."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 

@@ -1,5 +1,7 @@
 """How the detector predicts a body: by the bodies' own motion model, not by the camera's."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

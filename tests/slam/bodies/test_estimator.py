@@ -1,5 +1,7 @@
 """The estimate of a moving body: accuracy, honesty, stops, occlusion, bad points, and that every back end serves."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from functools import partial
 

@@ -1,5 +1,7 @@
 """Which feature continues which track."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Who belongs to a body: on tables of tracks whose points and motions are known."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

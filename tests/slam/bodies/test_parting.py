@@ -1,5 +1,7 @@
 """Landmarks that part from the rest in a frame, before it is known what moves."""
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 

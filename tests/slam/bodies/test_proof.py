@@ -1,5 +1,7 @@
 """Whether a body moved: a test against all that is uncertain."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

@@ -1,5 +1,7 @@
 """Where a body is, by the few points that are seen of it."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

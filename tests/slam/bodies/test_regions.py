@@ -1,5 +1,7 @@
 """Regions that are followed until they have moved by their own size: tracks come and go, the region stays."""
 
+from __future__ import annotations
+
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,5 +1,7 @@
 """A change of the rig's correction is no motion of what is seen."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from slam.bodies.config import ObjectsConfig

@@ -1,5 +1,7 @@
 """Which tracks moved together: in the world, on a body, and in the newest frame."""
 
+from __future__ import annotations
+
 from types import SimpleNamespace
 from typing import Any
 

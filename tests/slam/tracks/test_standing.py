@@ -1,5 +1,7 @@
 """Whether the camera stands: by features that stay, whatever moves in front of it."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np
