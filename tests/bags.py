@@ -1,7 +1,5 @@
 """Small ROS recordings, written by rosbags itself."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

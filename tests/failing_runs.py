@@ -1,7 +1,5 @@
 """For runs that end badly: a sequence of features that breaks, and a front end that gives them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small sequences of every format, written into a folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -61,6 +59,13 @@ def write_image(path: Path, seed: int, width: int = WIDTH, height: int = HEIGHT)
     assert cv2.imwrite(str(path), picture(seed, width, height))
 
 
+def write_pairs(left: Path, right: Path, name: str = "{:06d}.png") -> None:
+    """Six pairs of images, in a folder for each camera."""
+    for folder, first in ((left, 0), (right, 10)):
+        for i in range(6):
+            write_image(folder / name.format(i), first + i)
+
+
 def cut(path: Path, share: float = 0.5) -> None:
     """Keep the first part of a file."""
     data = path.read_bytes()
@@ -110,9 +115,7 @@ def projection_row(name: str, offset: float) -> str:
 def write_kitti(dataset: Path) -> Path:
     """Six frames of KITTI odometry in the publishers' layout, with poses; the path goes straight ahead."""
     folder = dataset / "sequences" / "03"
-    for number in (0, 1):
-        for i in range(6):
-            write_image(folder / f"image_{number}" / f"{i:06d}.png", i + 10 * number)
+    write_pairs(folder / "image_0", folder / "image_1")
     rows = [projection_row("P0", 0), projection_row("P1", -25), projection_row("P2", 3), projection_row("P3", -22)]
     (folder / "calib.txt").write_text("\n".join([*rows, "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0"]) + "\n")
     (folder / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(6)))
@@ -125,12 +128,10 @@ def write_kitti(dataset: Path) -> Path:
 def write_raw(day: Path) -> Path:
     """Six frames of a KITTI raw drive; the calibration is in the day's folder."""
     drive = day / "2011_09_26_drive_0013_sync"
-    for number in (0, 1):
-        camera = drive / f"image_{number:02d}"
-        for i in range(6):
-            write_image(camera / "data" / f"{i:010d}.png", i + 10 * number)
-        times = [f"2011-09-26 13:10:{51 + 0.1 * i:.9f}\n" for i in range(6)]
-        (camera / "timestamps.txt").write_text("".join(times))
+    write_pairs(drive / "image_00/data", drive / "image_01/data", "{:010d}.png")
+    times = [f"2011-09-26 13:10:{51 + 0.1 * i:.9f}\n" for i in range(6)]
+    for camera in ("image_00", "image_01"):
+        (drive / camera / "timestamps.txt").write_text("".join(times))
     rows = ["calib_time: 09-Jan-2012 13:57:47", f"S_00: {WIDTH + 10} {HEIGHT + 10}"]
     for camera_name, offset in (("00", 0), ("01", -25)):
         rows += [f"S_rect_{camera_name}: {WIDTH} {HEIGHT}", projection_row(f"P_rect_{camera_name}", offset)]

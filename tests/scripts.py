@@ -1,7 +1,5 @@
 """Scripts outside of any package, as modules; the command in this process."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from pathlib import Path

@@ -8,8 +8,6 @@ Prints a line for each fault, with the first test that fails. Exit status 1 wher
 `tests/test_seeded_faults.py` checks that what is changed still stands in the code, once.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import re

@@ -1,7 +1,5 @@
 """What the documentation shows is run as it stands there."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import shlex
@@ -85,7 +83,7 @@ def test_a_pose_is_found_among_known_points():
 @pytest.mark.parametrize("name", ["walk", "walk.bag"])  # ROS 2, ROS 1
 @pytest.mark.parametrize("rig", ["rectified", "toedin"])
 def test_a_bag_is_written_and_read_again(tmp_path, monkeypatch, rig, name):
-    source = f"synthetic:desk?frames=3&rig={rig}"
+    source = f"synthetic:desk?frames=3&width=160&height=120&rig={rig}"
     monkeypatch.setattr(sys, "argv", ["write_bag.py", source, str(tmp_path / name)])
     runpy.run_path(str(DOCS / "examples" / "write_bag.py"))
     written, read = slam.open_sequence(source), slam.open_sequence(tmp_path / name)

@@ -1,7 +1,5 @@
 """Every command that a page shows is run: in the page's order, in one folder, on a few frames of stand-ins."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

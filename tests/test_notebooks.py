@@ -1,7 +1,5 @@
 """The notebooks of the documentation run, and show what they say."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,10 +1,9 @@
 """Imports run one way, between packages and between the rooms of `slam`, in no circle; each brings what it needs."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -70,6 +69,7 @@ def modules(*packages: str) -> dict[str, Path]:
     return found
 
 
+@cache
 def named(file: Path) -> list[tuple[str, set[str]]]:
     """What a file imports, also inside functions and for types alone: each module, and the names taken from it."""
     nodes = list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))

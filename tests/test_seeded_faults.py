@@ -1,7 +1,5 @@
 """The faults of `tests/seeded_faults.py` can still be put into the code: what each changes stands in its file, once."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.seeded_faults import FAULTS, ROOT

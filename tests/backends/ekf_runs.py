@@ -1,7 +1,5 @@
 """Runs of the EKF on simulated scenes, for its tests."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from backends.ekf import EkfBackend
@@ -9,7 +7,7 @@ from backends.ekf.covariance import CAMERA, HEAD, Covariance
 from slam.data import Observations
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
-from tests.backends.scenes import Scene, path, scene, step
+from tests.backends.scenes import Scene, path, run, scene
 
 FORWARD, STILL = np.array([0, 0, 1.5]), np.zeros(3)
 YAW, ROLL = np.array([0, 1.0, 0]), np.array([0, 0, 1.0])
@@ -32,8 +30,7 @@ def dense(covariance: Covariance) -> np.ndarray:
 def halfway(data: Scene, frames: int, models: EstimatorModels = MODELS, **options) -> tuple[EkfBackend, set[int]]:
     """A filter after some frames of a scene, and the landmarks it knows."""
     backend, known = EkfBackend(data.rig, models, **options), set()
-    for stamp, _, seen in list(data)[:frames]:
-        step(backend, stamp, seen, known)
+    run(backend, list(data)[:frames], known)
     return backend, known
 
 

@@ -1,7 +1,5 @@
 """Generated sequences of calls that nobody should make: each is taken or refused as the interface says."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any

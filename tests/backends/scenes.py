@@ -1,8 +1,6 @@
 """A tiny deterministic scene for the tests of back ends: a rig, a path, points, and what the rig sees of them."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -141,7 +139,9 @@ def forget(backend: Backend, known: set[int], seen: Observations) -> None:
     known.difference_update(gone)
 
 
-def run(backend: Backend, data: Scene) -> list[UpdateReport]:
-    """All frames of a scene through a back end."""
-    known: set[int] = set()
+def run(
+    backend: Backend, data: Iterable[tuple[float, Array, Observations]], known: set[int] | None = None
+) -> list[UpdateReport]:
+    """Frames of a scene through a back end; `known` grows."""
+    known = set() if known is None else known
     return [step(backend, stamp, seen, known) for stamp, _, seen in data]

@@ -1,13 +1,10 @@
 """What all back ends assume alike: poses, how unsure they are, rest, and walks without end."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 import backends
-from backends.smoother.landmarks import SmootherLandmarks
 from slam.data import Observations
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
@@ -90,9 +87,7 @@ def test_frames_that_see_nothing_at_uneven_times_leave_the_same_uncertainty(name
     data = scene(path(6, 0.1, np.array([0.05, 0.0, 0.3]), np.array([0.0, 0.05, 0.0])), 60, 0.05, limit=20)
     filtered, other = (backends.create(each, RIG, models=SURE) for each in ("ekf", name))
     for backend in (filtered, other):
-        known: set[int] = set()
-        for stamp, _, seen in data:
-            step(backend, stamp, seen, known)
+        run(backend, data)
         for stamp in (0.75, 0.85, 1.35):
             backend.predict(stamp)
             backend.update(data.observations[-1].select(np.zeros(0, int)))
@@ -126,24 +121,9 @@ def test_frames_so_far_apart_that_no_turn_is_predicted_hang_together(name):
     data, found = scene(path(12, 0.1, np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.1, 0.0])), 60, seed=3), []
     for each in ("batch", name):
         backend = backends.create(each, RIG, models=EstimatorModels(MotionModel(1.0, 1.0), pixel_sigma=0.5))
-        known: set[int] = set()
-        for stamp, _, seen in data:
-            step(backend, 30 * stamp, seen, known)
+        run(backend, zip(30 * data.stamps, data.poses, data.observations))
         found.append(deviations(backend))
     assert (found[1] / found[0] > 0.98).all() and (found[1] / found[0] < 1.06).all(), found[1] / found[0]
-
-
-def test_drift_adds_up_while_a_landmark_is_not_seen():
-    none, certain = np.zeros((1, 3, 3)), 1e-4 * np.eye(3)[None]
-    marks = SmootherLandmarks.of(
-        np.array([0]), 0, np.array([[0.0, 0.0, 5.0]]), certain, none, False, np.zeros((1, 3, 0))
-    )
-    unseen, drift = np.zeros(0, np.intp), np.diag([1e-6, 2e-6, 3e-6, 1e-5, 2e-5, 3e-5])
-    once = marks.left_behind(unseen, np.eye(4), drift)
-    twice = once.left_behind(unseen, np.eye(4), drift)
-    assert np.trace(once.away[0]) > 1e-5
-    np.testing.assert_allclose(twice.away, 2 * once.away)
-    np.testing.assert_allclose(twice.from_newest, certain + twice.away)
 
 
 @pytest.mark.parametrize("name", ["ekf", "iekf", "smoother", "window"])

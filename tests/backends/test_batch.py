@@ -1,7 +1,5 @@
 """The batch optimum: without noise it is the truth, with noise the yardstick; it fails in one line at most."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import gtsam

@@ -1,7 +1,5 @@
 """The contract suite over every registered back end, and over a third-party one that comes by an entry point."""
 
-from __future__ import annotations
-
 import pickle
 import sys
 from dataclasses import replace
@@ -32,24 +30,19 @@ def by_name(check):
     return check.__name__
 
 
-#: The one that solves for everything in every frame takes ten times as long as the others.
-NAMES = [pytest.param(n, marks=pytest.mark.slow) if n == "batch" else n for n in backends.names()]
+#: Every registered one, a filter whose landmarks soon leave its state, and that of the docs. The one that solves for
+#: everything in every frame takes ten times as long as the others.
+MADE = {name: registry.resolve("backends", name) for name in backends.names()} | {
+    "few landmarks in the state": partial(EkfBackend, kept=3),
+    "docs": load_script("docs/examples/small_filter.py").SmallFilter,
+}
+NAMES = [pytest.param(name, marks=pytest.mark.slow) if name == "batch" else name for name in MADE]
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=by_name)
 @pytest.mark.parametrize("name", NAMES)
 def test_contract(name, check):
-    check(registry.resolve("backends", name))
-
-
-@pytest.mark.parametrize("check", CHECKS, ids=by_name)
-def test_a_filter_whose_landmarks_leave_its_state_passes_the_whole_contract(check):
-    check(partial(EkfBackend, kept=10))
-
-
-@pytest.mark.parametrize("check", CHECKS, ids=by_name)
-def test_the_filter_of_the_docs_passes_the_whole_contract(check):
-    check(load_script("docs/examples/small_filter.py").SmallFilter)
+    check(MADE[name])
 
 
 class Guarded(EkfBackend):
@@ -87,7 +80,7 @@ def test_a_guarded_back_end_keeps_count_of_its_additional_methods_and_gives_noth
     with pytest.raises(MeasurementError, match="already"):
         backend.add(replace(seen, ids=np.array([4])))
     assert pickle.loads(pickle.dumps(backend)).estimate().ids.tolist() == [3, 4]
-    small = load_script("docs/examples/small_filter.py").SmallFilter(RIG)
+    small = MADE["docs"](RIG)
     assert getattr_static(backend, "recent", None) is not None  # as Python 3.12 looks for a protocol's methods
     assert isinstance(backend, MapBackend) and not isinstance(small, MapBackend | RestingBackend | RevisingBackend)
 
@@ -159,14 +152,9 @@ def test_the_suite_finds_what_is_broken_and_says_it_in_a_sentence(broken):
 
 
 @pytest.mark.parametrize("seed", [*range(4), *(pytest.param(k, marks=pytest.mark.slow) for k in range(100, 103))])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", NAMES[:-1])  # not what the page keeps short
 def test_hostile_calls(name, seed):
-    play(registry.resolve("backends", name), seed, calls=60 if seed < 100 else 80)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_hostile_calls_to_a_filter_whose_landmarks_leave_its_state(seed):
-    play(partial(EkfBackend, kept=3), seed, calls=60)
+    play(MADE[name], seed, calls=60 if seed < 100 else 80)
 
 
 def test_the_command_prints_how_far_a_back_end_comes(capsys, monkeypatch):

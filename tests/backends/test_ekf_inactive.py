@@ -1,7 +1,5 @@
 """Landmarks that have left the filter's state: where they are, how uncertain, and what they do once seen again."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 
 import numpy as np

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -77,8 +75,7 @@ def test_wrong_matches_after_a_gap_are_left_out(make, kind, gap):
     for seed in range(3):
         data, rng = scene(forward, 600, models.pixel_sigma, seed=seed, limit=40), np.random.default_rng(seed)
         backend, known = make(RIG, models), set()
-        for stamp, _, seen in list(data)[:-1]:
-            step(backend, stamp, seen, known)
+        run(backend, list(data)[:-1], known)
         seen, wrong = data.observations[-1], rng.random((40, 1)) < 0.2
         left, right = rng.uniform(-200, 200, (2, 40, 2)) * wrong
         seen = Observations(seen.ids, seen.uv_left + left, seen.uv_right + right)

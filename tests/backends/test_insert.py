@@ -1,7 +1,5 @@
 """Landmarks whose place is known beforehand, in the world or before the camera, in every back end."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -10,12 +8,10 @@ from backends.ekf.landmarks import Slide
 from slam.data import Observations, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
-from slam.geometry.rig import StereoRig
 from slam.interfaces import MapBackend
 from slam.models import EstimatorModels, SlideModel
-from tests.slam.numeric import chained
+from tests.backends.scenes import RIG, observe, path
 
-RIG = StereoRig.rectified_pair(f=400.0, u0=319.5, v0=239.5, baseline=0.2, width=640, height=480)
 SIGMA = 0.5
 DT = 0.1
 KNOWN = 0.01  # standard deviation of what is known of a landmark [m]
@@ -29,18 +25,11 @@ class Scene:
     def __init__(self, frames: int = 12) -> None:
         rng = np.random.default_rng(3)
         self.points = rng.uniform((-3, -2, 4), (3, 2, 9), (40, 3))
-        self.ids = 7 + 3 * np.arange(40)
+        self.ids = np.arange(40)
         self.believed = self.points + KNOWN * rng.standard_normal((40, 3))
         self.covariances = np.tile(KNOWN**2 * np.eye(3), (40, 1, 1))
-        step = se3.exp(DT * np.array([0.02, 0.1, -0.05, 0.2, -0.1, 0.3]))
-        self.poses = START @ chained([step] * (frames - 1))
-        self.seen = [self._observe(T, rng) for T in self.poses]
-
-    def _observe(self, T, rng):
-        left, right = RIG.project(se3.transform(se3.inverse(T), self.points))
-        rows = np.flatnonzero(RIG.left.in_image(left) & RIG.right.in_image(right))
-        noise = SIGMA * rng.standard_normal((2, len(rows), 2))
-        return Observations(self.ids[rows], left[rows] + noise[0], right[rows] + noise[1])
+        self.poses = START @ path(frames, DT, np.array([0.2, -0.1, 0.3]), np.array([0.02, 0.1, -0.05]))
+        self.seen = [observe(T, self.points, SIGMA, rng, 40) for T in self.poses]
 
 
 def models(**changes):
@@ -191,7 +180,7 @@ def test_bad_input_is_refused_with_one_line(name, change, words):
     with pytest.raises(MeasurementError, match=words):
         backend.insert(*change(scene.ids, scene.believed, scene.covariances))
     backend.insert(scene.ids, scene.believed, scene.covariances)
-    with pytest.raises(MeasurementError, match=r"landmark 7 .*already"):
+    with pytest.raises(MeasurementError, match=r"landmark 0 .*already"):
         backend.insert(scene.ids, scene.believed, scene.covariances)
     with pytest.raises(MeasurementError, match="before the first predict"):
         backend.place(scene.ids + 1000, scene.believed, scene.covariances)

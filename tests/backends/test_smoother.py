@@ -1,7 +1,5 @@
 """What the contract does not ask of the smoother: poses of the graph, the lag, gaps, mended measurements."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import gtsam
@@ -13,7 +11,6 @@ from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker, to_pose3
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
-from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels, MotionModel
 from slam.window import motion
 from slam.window.stereo import RectifiedStereo
@@ -21,7 +18,6 @@ from tests.backends.scenes import RIG, forget, nees, observe, path, run, scene, 
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
 DT = 0.1
-KITTI = StereoRig.rectified_pair(707.0912, 601.8873, 183.1104, 0.53715065, 1226, 370)
 
 
 def drive(frames: int, **options):
@@ -103,9 +99,8 @@ def enter(backend, k: int, stamp: float, seen: Observations) -> None:
 @pytest.mark.parametrize(("options", "frames"), [({}, 1), ({}, 16), ({"lag": None}, 3), ({"lag": 4}, 4)], ids=str)
 def test_new_landmarks_in_a_frame_that_measured_nothing_leave_what_is_known(options, frames):
     """Until the next update the graph lacks its pose: all that is known of the poses before it went unheard."""
-    data, backend, known = list(drive(30, points=250)), SmootherBackend(RIG, MODELS, **options), set()
-    for stamp, _, seen in data[: 30 - frames]:
-        step(backend, stamp, seen, known)
+    data, backend = list(drive(30, points=250)), SmootherBackend(RIG, MODELS, **options)
+    run(backend, data[: 30 - frames])
     before, earlier = backend.estimate(), backend.recent(4)
     for k in range(30 - frames, 30):
         enter(backend, k, *data[k][::2])
@@ -136,8 +131,7 @@ def test_frames_that_measured_nothing_are_no_failure(lag, dark):
 @pytest.mark.parametrize("lag", [4, None])
 def test_a_long_rest_is_no_burden_and_its_map_is_still_known(lag):
     data, backend, known = list(drive(24, points=250)), SmootherBackend(RIG, MODELS, lag=lag), set()
-    for stamp, _, seen in data[:20]:
-        step(backend, stamp, seen, known)
+    run(backend, data[:20], known)
     last, before = data[19], sigma(backend)
     for k in range(1, 351):
         backend.predict_at_rest(last[0] + DT * k)

@@ -1,7 +1,5 @@
 """The smoother goes on: after failures of gtsam, interrupted calls, and where the camera has lost its way."""
 
-from __future__ import annotations
-
 from functools import cache
 from itertools import count
 
@@ -100,8 +98,7 @@ def test_errors_of_our_own_are_not_taken_for_gtsams(monkeypatch):
 def test_a_near_landmark_behind_a_camera_has_the_graph_built_anew(monkeypatch):
     """gtsam takes it for no information; of a near one it says that poses are wrong."""
     data, backend, known = list(drive(12)), SmootherBackend(RIG, MODELS), set()
-    for stamp, _, seen in data[:-1]:
-        step(backend, stamp, seen, known)
+    run(backend, data[:-1], known)
     solve, ahead = pose_only.solve, se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 3.0]))
     monkeypatch.setattr(pose_only, "solve", lambda *arguments: (solve(*arguments)[0] @ ahead, solve(*arguments)[1]))
     reason = step(backend, *data[-1][::2], known).reason
@@ -140,8 +137,7 @@ def test_a_graph_that_cannot_be_built_with_landmarks_as_variables_is_built_witho
     """Where that failed in a revision it failed in every later frame."""
     data, known = scene(path(60, DT, np.array([0.05, 0.0, 0.0]), np.zeros(3)), points=8, limit=8), set()
     backend = SmootherBackend(RIG, MODELS)
-    for stamp, _, seen in list(data)[:50]:
-        step(backend, stamp, seen, known)
+    run(backend, list(data)[:50], known)
     assert backend.state.landmarks.variable.any()
 
     def fail(*_):

@@ -1,7 +1,5 @@
 """The window back end: against the optimum, its consistency over many runs, and memory that does not grow."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Images of smooth random texture, and pairs of them with known motion."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import cv2

@@ -1,7 +1,5 @@
 """`Surf` in the hands of somebody who knows OpenCV's Feature2D."""
 
-from __future__ import annotations
-
 import inspect
 
 import cv2

@@ -1,7 +1,5 @@
 """The front end as the system calls it, and how it spreads features over the image."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np

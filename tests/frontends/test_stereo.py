@@ -1,7 +1,5 @@
 """Stereo matches on pairs with known disparity, and patches found again in a later pair."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Detection and description, also against OpenCV's own SURF, kept in surf_reference.npz."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree

@@ -1,7 +1,5 @@
 """The whole system against a plain model of what it has to keep count of."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a class of inputs is, and the run of one case under limits of time and memory."""
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil

@@ -1,7 +1,5 @@
 """Hostile values, and files changed by somebody or something: by their ending, what is done to their contents."""
 
-from __future__ import annotations
-
 import io
 import json
 import struct

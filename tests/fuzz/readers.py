@@ -1,7 +1,5 @@
 """Folders of every format, and ROS recordings, with hostile files in them."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from functools import cache

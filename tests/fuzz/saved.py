@@ -1,7 +1,5 @@
 """Files that earlier runs have left, with hostile bytes, members and values; what is accepted must work."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import tempfile

@@ -5,8 +5,6 @@ what is promised is kept: a result, or a `SlamError` of one line, within `harnes
 bounded memory, with nothing printed. ``FUZZ=0:1000 pytest tests/fuzz`` tries so many of every class.
 """
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """A short run and its digest; ``python -m tests.slam.digest`` prints those of back ends, or of parts, as JSON."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys

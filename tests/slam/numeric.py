@@ -1,6 +1,4 @@
-"""Numerical derivatives, the rounding of matrices, and simple paths, for the tests."""
-
-from __future__ import annotations
+"""Numerical derivatives, random covariances, and simple paths, for the tests."""
 
 from collections.abc import Callable, Iterable
 from itertools import accumulate
@@ -31,16 +29,6 @@ def straight(count: int, step: float = 1.0, dt: float = 0.1) -> Trajectory:
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 2, 3] = step * np.arange(count)
     return Trajectory(dt * np.arange(count), poses)
-
-
-def assert_equal_to_rounding(found: np.ndarray, expected: np.ndarray, steps: int = 1) -> None:
-    """The same matrix, but for the order in which sums were made: it depends on the processor's BLAS kernels.
-
-    A product of three matrices of a hundred rows has some two hundred terms an entry, each rounded to 1.1e-16, in
-    products up to ten times the largest entry: 2e-13 of that, bounded by 1e-12 for each of so many products (`steps`).
-    """
-    expected = np.asarray(expected)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=steps * 1e-12 * np.abs(expected).max(initial=0.0))
 
 
 def positive(n: int, rng: np.random.Generator) -> np.ndarray:

@@ -1,7 +1,5 @@
 """A camera before a cloud of points with descriptors, for tests of association and of the whole system."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Parts of elsewhere that raise or answer nonsense end a step with one line: the frame, the part and the method."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Settings: from text and files to their place, with types and ranges."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import fields

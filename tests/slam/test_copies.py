@@ -1,7 +1,5 @@
 """Systems that are copied go on to the same bytes, or say why they cannot be."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 

@@ -1,7 +1,5 @@
 """Outputs are checked before any work, and archives before they are unpacked: what is there stays, inputs always."""
 
-from __future__ import annotations
-
 import io
 import os
 import time

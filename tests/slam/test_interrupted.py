@@ -1,7 +1,5 @@
 """A step that an interrupt ends at any line did not happen: map and back end agree, and the next frames are tracked."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Iterator

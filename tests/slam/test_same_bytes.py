@@ -1,7 +1,5 @@
 """The same bytes with any number of threads, in any thread, with any hash seed, with kernels compiled or loaded."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """A drive that comes back: the loop is closed above any back end, and the path is better for it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

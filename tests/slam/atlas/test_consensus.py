@@ -1,7 +1,5 @@
 """A false loop that was closed first does not keep the true ones out that come later."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Maps in files, and starting in a map that is known."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from functools import cache
 

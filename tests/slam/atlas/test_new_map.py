@@ -1,7 +1,5 @@
 """A camera that is moved unseen to a place that it has not been to: a map of its own begins there, until a loop."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import groupby
 

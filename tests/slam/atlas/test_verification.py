@@ -1,7 +1,5 @@
 """A place seen again is the most similar one, and gives the pose between both views; another place gives none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A car's drive through points on both sides of a street, seen by a rig with known errors."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from slam.calibration import RigCorrection, RigModel, SelfCalibration, SelfCalibrationConfig

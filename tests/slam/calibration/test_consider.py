@@ -1,7 +1,5 @@
 """The rig's uncertainty in poses and landmarks: its sensitivities against what a wrong rig really does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -52,7 +50,7 @@ def error_of(name: str, size: float) -> np.ndarray:
     return delta
 
 
-def run(backend: str, delta: np.ndarray, frames: int = 45) -> tuple[StereoSlam, np.ndarray]:
+def run(backend: str, delta: np.ndarray, frames: int = 30) -> tuple[StereoSlam, np.ndarray]:
     cloud, system = Cloud(150), StereoSlam(RIG, None, backend, config=CONFIG)
     truth = path(frames)
     for k, T in enumerate(truth):

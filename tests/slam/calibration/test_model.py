@@ -1,7 +1,5 @@
 """What errors of a rig do to its pixels, and what a pair of views tells of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

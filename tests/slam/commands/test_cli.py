@@ -1,11 +1,8 @@
-from __future__ import annotations
-
 import subprocess
 import sys
 
 import pytest
 
-from slam.commands.demo import demo
 from slam.commands.run import require_no_recording
 from slam.errors import SlamError
 from slam.sequences import open_sequence
@@ -53,12 +50,3 @@ def test_a_recording_is_no_place_for_a_run(tmp_path):
 def test_bad_input_is_refused(tmp_path, words, said):
     with pytest.raises(SlamError, match=said):
         command(*(str(word).replace("{empty}", str(tmp_path)) for word in words), "--out", tmp_path / "out")
-
-
-@pytest.mark.slow
-def test_the_demo_speaks_of_a_box_only_where_one_was_found(tmp_path, monkeypatch, capsys):
-    """In three frames nothing is known to move."""
-    monkeypatch.setattr("slam.commands.demo.ONLINE", ("ekf",))
-    demo(tmp_path / "out", 3)
-    said = " ".join(capsys.readouterr().out.split())
-    assert "frame.png, without the box: to find it takes more --frames" in said and "the box in the image" not in said

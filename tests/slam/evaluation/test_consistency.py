@@ -1,7 +1,5 @@
 """NEES of relative poses, against simulated odometry whose covariances are known."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Accuracy figures: equal to evo's, right where the answer is known, defined where the path says little."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

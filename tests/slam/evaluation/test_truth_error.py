@@ -1,7 +1,5 @@
 """Errors of the truth, found from the truth alone: how fast they change, a drift, stretches that cannot be right."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Pairing by nearest stamp, and the fewest rows dropped that make time increase."""
 
-from __future__ import annotations
-
 from itertools import combinations, pairwise
 
 import numpy as np

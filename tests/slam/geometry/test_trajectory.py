@@ -1,7 +1,5 @@
 """Trajectories: what is written is read again, by us and by evo; malformed files are refused with their name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

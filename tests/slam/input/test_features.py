@@ -1,7 +1,5 @@
 """Frames that are not as documented are refused with one plain error before anything changes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from decimal import Decimal

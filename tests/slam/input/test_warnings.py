@@ -1,7 +1,5 @@
 """What looks wrong with images and times is said once each; what is right is left in peace."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Shared compiled helpers against NumPy and against differences."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

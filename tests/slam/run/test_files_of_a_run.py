@@ -1,7 +1,5 @@
 """Files of a run where they cannot all be written, and runs that end badly."""
 
-from __future__ import annotations
-
 import json
 import resource
 import signal

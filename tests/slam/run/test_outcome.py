@@ -1,7 +1,5 @@
 """A run in which most frames were not tracked says so, with the first step that gave too little as the likely cause."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

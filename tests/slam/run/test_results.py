@@ -1,7 +1,5 @@
 """Whether covariances hold: one judgement for a run and for a comparison, which says by what it judges."""
 
-from __future__ import annotations
-
 import pytest
 
 from slam.compare.plan import Plan, Trial

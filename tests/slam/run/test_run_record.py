@@ -1,7 +1,5 @@
 """What a summary says of the frames of a run."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

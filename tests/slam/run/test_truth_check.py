@@ -1,7 +1,5 @@
 """The usual mistakes of a file of true poses are named, and one that fits is not doubted."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

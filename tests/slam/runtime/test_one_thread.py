@@ -1,7 +1,5 @@
 """Systems in threads: each as if it were alone; one system used from two threads says so and is not broken."""
 
-from __future__ import annotations
-
 import pickle
 import threading
 from functools import cache

@@ -1,7 +1,5 @@
 """Items made ahead: the same ones in the same order, exceptions in their place, no thread left behind."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading

@@ -1,7 +1,5 @@
 """Small sequences of every format in a temporary folder."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

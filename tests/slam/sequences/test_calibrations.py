@@ -1,7 +1,5 @@
 """Calibrations of every form, and rigs by camera matrices: what they say, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

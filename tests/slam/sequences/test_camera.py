@@ -1,7 +1,5 @@
 """Cameras, played by video files and by a class that stops giving frames, and frames at their own rate."""
 
-from __future__ import annotations
-
 import threading
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Two folders or videos and what people bring: names of images, layouts, tolerances, masks, rigs of any stand."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

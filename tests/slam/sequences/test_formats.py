@@ -1,7 +1,5 @@
 """EuRoC's and KITTI's data sets, found out by themselves and read right; small sequences of known content."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -204,9 +202,7 @@ def test_kitti_raw_truth_keeps_a_fixed_point_where_it_is(raw: Path, colour: bool
 
 def test_kitti_tracking_as_downloaded(tmp_path: Path) -> None:
     root = tmp_path / "training"
-    for camera, first in (("image_02", 0), ("image_03", 10)):
-        for i in range(6):
-            recordings.write_image(root / camera / "0003" / f"{i:06d}.png", first + i)
+    recordings.write_pairs(root / "image_02/0003", root / "image_03/0003")
     with pytest.raises(SequenceError, match="below it is image_02/0003: give that"):
         open_sequence(root)
     with pytest.raises(CalibrationError, match="add calibration=FILE"):
@@ -221,10 +217,9 @@ def test_kitti_tracking_as_downloaded(tmp_path: Path) -> None:
 
 def test_kitti_360_as_downloaded(tmp_path: Path) -> None:
     drive = tmp_path / "data_2d_raw" / "2013_05_28_drive_0000_sync"
-    for camera, first in (("image_00", 0), ("image_01", 10)):
-        for i in range(6):
-            recordings.write_image(drive / camera / "data_rect" / f"{i:010d}.png", first + i)
-        times = [f"2013-05-28 08:46:{2 + 0.1 * i:012.9f}\n" for i in range(6)]
+    recordings.write_pairs(drive / "image_00/data_rect", drive / "image_01/data_rect", "{:010d}.png")
+    times = [f"2013-05-28 08:46:{2 + 0.1 * i:012.9f}\n" for i in range(6)]
+    for camera in ("image_00", "image_01"):
         (drive / camera / "timestamps.txt").write_text("".join(times))
     rows = ["S_rect_00: 64 48", "R_rect_00: 1 0 0 0 1 0 0 0 1", "S_rect_01: 64 48"]
     rows += [projection_row("P_rect_00", 0), projection_row("P_rect_01", -25)]

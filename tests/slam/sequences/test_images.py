@@ -1,7 +1,5 @@
 """Single images: whole, or refused with a reason, never half; a damaged one costs its frame, or its right image."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

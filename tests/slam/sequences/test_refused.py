@@ -1,7 +1,5 @@
 """Sequences that are damaged, also on purpose: refused in one line, or single rows and pairs left out."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """ROS recordings of all kinds, written by rosbags itself: topics found, stamps paired, cameras calibrated."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

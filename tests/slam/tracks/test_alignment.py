@@ -1,7 +1,5 @@
 """Features aligned to their first sight: the geometry, the bookkeeping, and what it is worth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

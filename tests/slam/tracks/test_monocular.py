@@ -1,7 +1,5 @@
 """Depth from two views of one moving camera, and running on left images alone."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import numpy as np

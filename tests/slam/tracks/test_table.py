@@ -1,7 +1,5 @@
 """The table of tracks: a row is one point, whatever becomes of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

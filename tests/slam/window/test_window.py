@@ -1,7 +1,5 @@
 """The window solver against dense least squares, finite differences, and itself with something marginalised."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -257,20 +255,6 @@ def test_poses_that_leave_changes_nothing(leaves):
     before = solve(w).pose_covariance[np.ix_(keep, keep)]
     np.testing.assert_allclose(after.pose_covariance, before, rtol=1e-3, atol=1e-9)
     np.testing.assert_allclose(conditional.mean, 0, atol=1e-6)
-
-
-def test_what_left_follows_what_stayed():
-    """The conditional is that of the joint covariance: moving the rest as one moves what left along."""
-    w = solve(window()).window
-    rows = w.rows
-    part = replace(w, rows=rows.select(rows.pose == 1), joining=np.arange(POINTS))
-    prior, conditional, _ = marginalised(part, [1], np.zeros(0, bool))
-    M = se3.exp(1e-4 * np.array([1.0, -2, 0.5, 3, 1, -2]))
-    others = np.arange(POSES) != 1
-    points = se3.transform(M, w.points[prior.points]) - w.points[prior.points]
-    poses = np.array([se3.log(se3.inverse(T) @ M @ T) for T in w.poses[others]])
-    x = conditional.of(points, poses)[1][0]
-    np.testing.assert_allclose(w.poses[1] @ se3.exp(x), M @ w.poses[1], atol=1e-6)
 
 
 def test_a_point_that_has_moved_far_counts_by_its_inverse_distance():

@@ -1,7 +1,5 @@
 """Drives along paths of files, and the streets beside them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

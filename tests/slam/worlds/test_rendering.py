@@ -1,7 +1,5 @@
 """The renderer, on a world with a board of known corners."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The built-in worlds, and one that is written and read back."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
