@@ -1,7 +1,5 @@
 """Errors of the poses of a run that is done, and what was claimed of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
