@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import path_of, recordings
 from slam.config import SystemConfig
-from slam.data import CommonError, FrameResult
+from slam.data import FrameResult
 from slam.evaluation.joint_errors import JointErrors, with_newest
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.trajectory import Trajectory
@@ -54,15 +54,8 @@ CLOSINGS = ((5, 340, 0.07), (10, 345, 0.04), (5, 345, 0.52), (10, 340, 0.50))
 
 
 def exact_rig() -> AbstractContextManager[object]:
-    """The rig's uncertainty is added to nothing."""
-    stack = ExitStack()
-    for name, put in (
-        ("slam.calibration.estimator.RemainingRigError.follow", lambda *_, **__: None),
-        ("slam.calibration.estimator.RemainingRigError.added_to", lambda _, __, estimate: estimate),
-        ("slam.calibration.estimator.RemainingRigError.common", lambda *_, **__: CommonError()),
-    ):
-        stack.enter_context(mock.patch(name, put))
-    return stack
+    """The rig's uncertainty is added to nothing: no back end is asked to follow it."""
+    return mock.patch("slam.calibration.estimator.ConsideringBackend", type("Nobody", (), {}))
 
 
 def nothing_parts() -> AbstractContextManager[object]:
