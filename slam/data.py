@@ -318,7 +318,7 @@ class Correction(Revision, Protocol):
 class FrameStatus(StrEnum):
     """How a frame ended.
 
-    STARTED: the map begins, with the first frame that shows anything. TRACKED: the pose was measured against the map.
+    STARTED: the map begins, with the first frame that shows enough. TRACKED: the pose was measured against the map.
     Else it is the motion model's. PREDICTED: too few matches. LOST: too few for several frames. FAILED: no solution.
     """
 

@@ -328,7 +328,8 @@ def _status(step: Step, mapped_before: bool) -> tuple[FrameStatus, str]:
     if not step.tracking.unmeasured:
         return FrameStatus.TRACKED, ""
     if not mapped_before:
-        return (FrameStatus.STARTED, "") if len(step.added) else (FrameStatus.PREDICTED, "nothing to see yet")
+        begun = len(step.tracks.mapped) >= MINIMAL_POINTS
+        return (FrameStatus.STARTED, "") if begun else (FrameStatus.PREDICTED, "nothing to see yet")
     reason = REPEATED if step.repeated else step.report.reason
     if step.matches.doubted:
         reason = f"{step.matches.doubted} landmarks agree on a pose too far from the prediction to be believed at once"

@@ -46,7 +46,7 @@ def outcome(
     taken for a cause; repeated images are counted instead. `dropped` frames of a live run came too late; `doubt`, of
     `motion_doubt`, is a cause where nothing else is one. What was `recorded` has no images.
     """
-    untracked = [row for row, status in enumerate(record.statuses) if row and status != _TRACKED]
+    untracked = [row for row, status in enumerate(record.statuses) if row and status not in (_TRACKED, _STARTED)]
     frames, missed = len(record.statuses) - 1, len(untracked)
     if frames < 1 or missed <= _MANY * frames:
         return ""

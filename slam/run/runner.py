@@ -10,10 +10,12 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from slam import registry
 from slam.atlas.map_io import load_map, save_map
 from slam.calibration import load_calibration
-from slam.data import FrameResult, StereoFrame
+from slam.data import FrameResult, FrameStatus, StereoFrame
 from slam.errors import SlamError, one_line, text_of
 from slam.evaluation.objects import labels_in_images, score_for
 from slam.evaluation.summary import with_truth
@@ -187,9 +189,11 @@ class _Run:
                     if score is not None:
                         score.add(number, result, labels_in_images(self.sequence, number, result.features))
                     if options.record is not None:
-                        if len(record.seen) == len(result.added):  # another back end has begun with them
+                        given = RecordedFrame.of(result, number)
+                        if result.status is FrameStatus.STARTED:  # another back end has begun with these landmarks
                             self.tape.clear()
-                        self.tape.append(RecordedFrame.of(result, number))
+                            given = replace(given, removed=np.intersect1d(given.removed, given.added.ids))
+                        self.tape.append(given)
                     if on_frame is not None:
                         on_frame(result)
                     if self.until.is_set():

@@ -265,7 +265,6 @@ class Tracks(LandmarkTable):
         self.number[rows], self.unfound[rows], self.expelled[rows], self.parted[rows] = numbers, 0, False, 0
         self.anchor[rows] = self.position[rows] = points
         self.forget_past(rows)
-        self.patches[rows[self.ids[rows] < 0]] = None
         self.look[rows], self.laplacian[rows] = (x[self.row[rows]] for x in (features.descriptors, features.laplacian))
 
     def give_up(self, rows: IndexArray) -> None:
@@ -276,5 +275,6 @@ class Tracks(LandmarkTable):
     def forget_past(self, rows: IndexArray) -> None:
         """Make tracks free and without measurements, in place."""
         self.body[rows], self.misfit[rows], self.streak[rows], self.doubtful[rows] = -1, 0, 0, False
+        self.patches[rows[self.ids[rows] < 0]] = None  # a body's coordinates may have changed once it is found again
         for array in (self.A, self.p, self.dof, self.velocity):
             array[rows] = 0

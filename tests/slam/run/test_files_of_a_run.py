@@ -6,11 +6,11 @@ import signal
 import stat
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 
 from slam.atlas.map_io import load_map
 from slam.config import SystemConfig
-from slam.data import StereoFeatures
 from slam.errors import SlamError
 from slam.files import whole_file
 from slam.run import runner
@@ -99,13 +99,14 @@ def test_one_last_file_that_fails_loses_no_other(tmp_path, bad):
         assert len(load_map(save_map))
 
 
-def test_a_recording_begins_with_the_first_landmarks(tmp_path):
+@pytest.mark.parametrize("few", [0, 2])
+def test_a_recording_begins_where_enough_is_seen(tmp_path, few):
     """What it is replayed into then starts there, as the run's back end has."""
 
     class Covered(Features):
         def extract(self, frame):
             features = super().extract(frame)
-            return StereoFeatures.empty(features.stamp) if frame.index < 2 else features
+            return features.select(np.arange(few)) if frame.index < 2 else features
 
     options = RunOptions("ekf", "none", SystemConfig(), tmp_path / "out", record=tmp_path / "a.npz")
     runner.run(Scripted(None, 0), options, frontend=Covered())

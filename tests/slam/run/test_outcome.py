@@ -49,6 +49,8 @@ def test_the_first_step_that_gave_too_little_is_the_cause(features, baseline, mo
 def test_a_few_frames_that_were_not_tracked_are_no_bad_run():
     assert not outcome(record(18), RIG, OPTIONS)
     assert outcome(record(17), RIG, OPTIONS).startswith("3 of 21")
+    late = [*["predicted"] * 5, "started", *["tracked"] * 15]
+    assert outcome(RunRecord(statuses=late, features=[(8, 8)] * 21), RIG, OPTIONS).startswith("5 of 21")
 
 
 def moving(times_too_short: float, frames: int = 40) -> RunRecord:

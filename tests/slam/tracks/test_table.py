@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from slam.data import StereoFeatures
-from slam.tracks.table import LandmarkTable, Tracks
+from slam.tracks.table import LandmarkTable, Patch, Tracks
 from tests.slam.scene import features_at
 
 HERE = np.zeros(3)
@@ -32,6 +32,14 @@ def test_a_track_that_becomes_a_landmark_keeps_its_row_and_its_past():
     assert tracks.count(np.array([1])) == 4
     assert tracks.landmarks().ids.tolist() == [5, 20] and tracks.landmarks().last_seen.tolist() == [7, 7]
     assert tracks.rows(np.array([20, 5])).tolist() == tracks.mapped[::-1].tolist() == [2, 1]
+
+
+def test_a_free_track_has_no_patch_of_the_body_that_it_left_but_a_landmark_keeps_its_own():
+    tracks, patch = followed(2), Patch(np.zeros((3, 3), np.float32), np.ones(2), 9.0, 4, np.eye(4))
+    tracks.enter_landmarks(0, np.array([5]), features(2), np.array([0]), HERE)
+    tracks.patches[:2] = [patch, patch]
+    tracks.forget_past(np.arange(2))
+    assert tracks.has_patch(np.arange(2), 4).tolist() == [True, False]
 
 
 def test_a_feature_of_another_landmark_s_track_or_of_none_begins_a_row():
