@@ -344,7 +344,8 @@ class FrameResult:
         estimate: pose after the step, without landmarks; `StereoSlam.estimate` includes them.
         report: the back end's report.
         features: of the frame, without those outside of the rectified image and of what is fastened to a vehicle: rows
-            count what is left.
+            count what is left. Landmarks' are aligned with earlier images, bodies' as found: `objects` are of aligned
+            ones.
         predicted: number of landmarks in the angle of view.
         matched, matched_features: ids of landmarks found, after the geometric check, and rows of their features (K,).
         added, added_features: ids of landmarks that joined the map, and rows of their features (A,).

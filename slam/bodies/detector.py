@@ -76,8 +76,8 @@ class ObjectDetector:
 
         The table changes in place; landmarks that were found have their feature already. `estimate` is that after the
         update, `recent` the last poses if the back end knows how their errors hang together, `still` are rows of
-        features that stay at their pixels while the camera stands, and `measured` the features before the calibration
-        corrected them, which the `aligner` moves.
+        features that stay at their pixels while the camera stands. `measured` are the features before the calibration
+        corrected them: those of proven bodies are moved by the `aligner`, where there is one.
         """
         none = np.zeros(0, np.intp)
         return MotionLabels(none, none, np.zeros(0, np.int64)), ()
